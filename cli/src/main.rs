@@ -1,0 +1,2 @@
+//! The cantap command.
+fn main() {}

@@ -1,0 +1,8 @@
+//! The cantap host library: devices, records, time, statistics; trace files and signals behind
+//! features, so that a program that only captures stays small.
+
+pub mod trace;
+
+pub use cantap_wire as wire;
+pub use cantap_wire::{Channel, Frame, Id};
+pub use trace::{Direction, TraceEvent, TraceRecord};

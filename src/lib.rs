@@ -1,0 +1,2 @@
+//! cantap firmware logic.
+#![cfg_attr(not(test), no_std)]

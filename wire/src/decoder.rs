@@ -1,0 +1,207 @@
+//! The host's end of the stream: bytes in, records and responses out.
+//!
+//! It holds one message and no more. Whatever the bytes are, it does not panic, accepts nothing
+//! whose CRC does not match, finds the next message after garbage, and reports what is missing.
+
+use crate::batch::BatchHeader;
+use crate::framing::{FramingError, MAX_ENCODED, unseal};
+use crate::message::{DeviceMessage, Response};
+use crate::record::{self, Record};
+use crate::{CHANNELS, PROTOCOL_VERSION};
+
+/// Why bytes were thrown away.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Corruption {
+    /// Not a message: framing or CRC.
+    Framing(FramingError),
+    /// More bytes without a zero than any message has.
+    TooLong,
+    /// A message that is not of this protocol version.
+    Unknown,
+    /// A batch that is older than one already seen. Its frames were reported as lost.
+    OutOfOrder {
+        /// Its sequence number.
+        sequence: u32,
+    },
+    /// A batch whose records end in something unreadable. The records before are good, and the
+    /// next batch's [`Decoded::BatchesLost`] counts the frames that follow it.
+    Records,
+}
+
+/// What [`Decoder::push`] reports.
+#[derive(Clone, Debug, PartialEq, Eq)]
+#[allow(clippy::large_enum_variant, reason = "responses are rare and passed by reference")]
+pub enum Decoded<'a> {
+    /// A record at its absolute device time.
+    Record {
+        /// Ticks since the device started.
+        ticks: u64,
+        /// The record.
+        record: Record,
+    },
+    /// An answer.
+    Response(&'a Response),
+    /// Batches, or the end of one, are missing between the last record and the next.
+    BatchesLost {
+        /// How many whole batches.
+        batches: u32,
+        /// How many received frames went with them, per channel.
+        frames: [u32; CHANNELS],
+    },
+    /// Bytes were thrown away.
+    Corrupt(Corruption),
+    /// The device speaks this other protocol version.
+    OtherProtocol(u16),
+}
+
+/// Decodes a device's byte stream.
+pub struct Decoder {
+    partial: [u8; MAX_ENCODED],
+    len: usize,
+    /// Throwing away up to the next zero.
+    overlong: bool,
+    sequence: u32,
+    frames: [u32; CHANNELS],
+    message: [u8; MAX_ENCODED],
+}
+
+impl Decoder {
+    /// A decoder that expects the first batch after `Hello`.
+    pub const fn new() -> Self {
+        Self {
+            partial: [0; MAX_ENCODED],
+            len: 0,
+            overlong: false,
+            sequence: 0,
+            frames: [0; CHANNELS],
+            message: [0; MAX_ENCODED],
+        }
+    }
+
+    /// Expects the first batch of a session again. To be called when the response to `Hello` came.
+    pub fn restart(&mut self) {
+        self.sequence = 0;
+        self.frames = [0; CHANNELS];
+    }
+
+    /// Takes any piece of the stream and reports what is complete.
+    pub fn push(&mut self, mut bytes: &[u8], mut report: impl FnMut(Decoded<'_>)) {
+        while let Some(end) = bytes.iter().position(|&byte| byte == 0) {
+            let (piece, rest) = bytes.split_at(end);
+            bytes = &rest[1..];
+            if self.overlong {
+                self.overlong = false;
+            } else if self.len == 0 {
+                self.message(Some(piece), &mut report);
+            } else if self.keep(piece) {
+                self.message(None, &mut report);
+            } else {
+                report(Decoded::Corrupt(Corruption::TooLong));
+            }
+            self.len = 0;
+        }
+        if !self.overlong && !self.keep(bytes) {
+            self.overlong = true;
+            self.len = 0;
+            report(Decoded::Corrupt(Corruption::TooLong));
+        }
+    }
+
+    fn keep(&mut self, piece: &[u8]) -> bool {
+        let Some(slot) = self.partial.get_mut(self.len..self.len + piece.len()) else {
+            return false;
+        };
+        slot.copy_from_slice(piece);
+        self.len += piece.len();
+        true
+    }
+
+    /// One whole message: `piece`, or what was kept.
+    fn message(&mut self, piece: Option<&[u8]>, report: &mut impl FnMut(Decoded<'_>)) {
+        let encoded = piece.unwrap_or(&self.partial[..self.len]);
+        // Zeros in a row are idle, not messages.
+        if encoded.is_empty() {
+            return;
+        }
+        if encoded.len() > self.message.len() {
+            return report(Decoded::Corrupt(Corruption::TooLong));
+        }
+        let message = match unseal(encoded, &mut self.message) {
+            Ok(message) => message,
+            Err(error) => return report(Decoded::Corrupt(Corruption::Framing(error))),
+        };
+        match postcard::take_from_bytes(message) {
+            Ok((DeviceMessage::Batch(header), records)) => {
+                if expect(&mut self.sequence, &mut self.frames, &header, report) {
+                    walk(records, header.base_ticks, &mut self.frames, report);
+                }
+            }
+            // A Hello whose fixed first field tells another version is not read any further.
+            Ok((DeviceMessage::Response(response), [])) => match foreign_protocol(message) {
+                Some(version) => report(Decoded::OtherProtocol(version)),
+                None => report(Decoded::Response(&response)),
+            },
+            _ => match foreign_protocol(message) {
+                Some(version) => report(Decoded::OtherProtocol(version)),
+                None => report(Decoded::Corrupt(Corruption::Unknown)),
+            },
+        }
+    }
+}
+
+impl Default for Decoder {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Holds the header against what was expected. Returns whether the batch may be read.
+fn expect(
+    sequence: &mut u32,
+    frames: &mut [u32; CHANNELS],
+    header: &BatchHeader,
+    report: &mut impl FnMut(Decoded<'_>),
+) -> bool {
+    let ahead = header.sequence.wrapping_sub(*sequence);
+    if ahead > u32::MAX / 2 {
+        report(Decoded::Corrupt(Corruption::OutOfOrder { sequence: header.sequence }));
+        return false;
+    }
+    let lost = core::array::from_fn(|channel| header.frames_before[channel].wrapping_sub(frames[channel]));
+    if ahead > 0 || lost != [0; CHANNELS] {
+        report(Decoded::BatchesLost { batches: ahead, frames: lost });
+    }
+    *sequence = header.sequence.wrapping_add(1);
+    *frames = header.frames_before;
+    true
+}
+
+/// Reports a batch's records.
+fn walk(
+    mut records: &[u8],
+    base_ticks: u64,
+    frames: &mut [u32; CHANNELS],
+    report: &mut impl FnMut(Decoded<'_>),
+) {
+    let mut ticks = base_ticks;
+    while !records.is_empty() {
+        let Ok((record, difference, rest)) = record::decode(records) else {
+            return report(Decoded::Corrupt(Corruption::Records));
+        };
+        ticks = ticks.wrapping_add_signed(i64::from(difference));
+        if let Record::Received(received) = &record {
+            let frames = &mut frames[received.channel.index()];
+            *frames = frames.wrapping_add(1);
+        }
+        report(Decoded::Record { ticks, record });
+        records = rest;
+    }
+}
+
+/// The version in a response to `Hello`, if it is not ours. It reads only what never changes: kind,
+/// request id, `Ok(Hello)` or `Err(Protocol)`, and the version in front.
+fn foreign_protocol(message: &[u8]) -> Option<u16> {
+    let ((kind, _id, result, variant, version), _) =
+        postcard::take_from_bytes::<(u8, u16, u8, u8, u16)>(message).ok()?;
+    (kind == 1 && result <= 1 && variant == 0 && version != PROTOCOL_VERSION).then_some(version)
+}

@@ -1,0 +1,70 @@
+//! What crosses USB between a cantap device and its host: the types, the framing, the limits and
+//! the version. Everything here exists once; the firmware, the host library and the emulator all
+//! use it, and `docs/wire-protocol.md` describes it for clients in other languages.
+//!
+//! No allocation and no `std`. It does no I/O and keeps no time of its own.
+#![cfg_attr(not(test), no_std)]
+
+pub mod batch;
+pub mod decoder;
+pub mod frame;
+pub mod framing;
+pub mod message;
+pub mod record;
+pub mod timing;
+
+pub use decoder::{Corruption, Decoded, Decoder};
+pub use frame::{Frame, Id};
+pub use message::{Command, Hello, Refusal, Reply, Request, Response};
+pub use record::{Event, Received, Record, Stamp};
+pub use timing::BitTiming;
+
+/// Version of everything this crate defines. A device and a host with different versions refuse
+/// each other with a message that says which side to update.
+pub const PROTOCOL_VERSION: u16 = 1;
+
+/// Name of the ELF symbol that holds [`PROTOCOL_VERSION`] as a little-endian `u16` in the
+/// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.
+pub const PROTOCOL_SYMBOL: &str = "CANTAP_PROTOCOL_VERSION";
+
+/// USB vendor and product ID. These are pid.codes' test IDs, for use until a product ID is assigned;
+/// they may not be shipped in a product.
+pub const USB_VID: u16 = 0x1209;
+/// See [`USB_VID`].
+pub const USB_PID: u16 = 0x0001;
+
+/// One of the device's two CAN channels.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, serde::Serialize, serde::Deserialize)]
+pub enum Channel {
+    /// CAN1, called 1 in every user interface.
+    Can1,
+    /// CAN2, called 2 in every user interface.
+    Can2,
+}
+
+impl Channel {
+    /// Both channels, in order.
+    pub const ALL: [Channel; CHANNELS] = [Channel::Can1, Channel::Can2];
+
+    /// 0 or 1, for indexing.
+    pub const fn index(self) -> usize {
+        self as usize
+    }
+
+    /// 1 or 2, as users count.
+    pub const fn number(self) -> u8 {
+        self as u8 + 1
+    }
+
+    /// The channel that users call `number`.
+    pub const fn from_number(number: u8) -> Option<Self> {
+        match number {
+            1 => Some(Channel::Can1),
+            2 => Some(Channel::Can2),
+            _ => None,
+        }
+    }
+}
+
+/// Channels a device has.
+pub const CHANNELS: usize = 2;

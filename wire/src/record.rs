@@ -1,0 +1,377 @@
+//! Records: what a device saw or did, in the order of its capture queue.
+//!
+//! A record begins with one byte that tells the kind:
+//!
+//! | first byte | then |
+//! |---|---|
+//! | `0x00..=0x3F` | an [`Event`]: this byte is postcard's enum index, its fields follow, then the time difference |
+//! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
+//! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
+//!
+//! Time differences are postcard's `i32` (zigzag, 7 bits a byte), in ticks since the record before.
+//! They are signed because a stamp may be computed back to before the other channel's last one.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Channel, Frame, Id};
+
+/// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
+pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + 5 + 8;
+/// Bytes of the longest record of any kind: an [`Event::Transmitted`] with eight data bytes, which is
+/// index, channel, tag, packed ID, DLC, length, data and time difference.
+pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + 5;
+
+const FRAME: u8 = 0x80;
+const QUALIFIED: u8 = 0x40;
+const QUALIFIER_MASK: u8 = 0xF8;
+const UPPER_BOUND: u8 = 1;
+const NO_STAMP: u8 = 2;
+const NO_DATA: u8 = 4;
+
+/// What the stamp of a received frame says.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Stamp {
+    /// Read at the end of the frame, plus the interrupt's latency.
+    Exact,
+    /// The frame was found queued behind another one: it ended at this time or earlier.
+    UpperBound,
+    /// Left out on request; the record's time is that of the record before.
+    Omitted,
+}
+
+/// A received frame.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Received {
+    /// Where it was received.
+    pub channel: Channel,
+    /// The frame. With [`Self::data_omitted`] its data bytes read zero.
+    pub frame: Frame,
+    /// What its time means.
+    pub stamp: Stamp,
+    /// Whether the data bytes were left out on request.
+    pub data_omitted: bool,
+}
+
+/// Where frames were lost on their way.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum LossStage {
+    /// The controller's hardware FIFO overran. It cannot tell how many frames it dropped.
+    Controller,
+    /// The device's record queue was full.
+    Queue,
+    /// Between device and host. Never in the stream: the host computes it from sequence numbers.
+    Link,
+    /// In the host: a consumer did not keep up. Never in the stream.
+    Host,
+}
+
+/// The error that a controller reports in its last-error code.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum BusErrorKind {
+    /// More than five equal bits in a row.
+    Stuff,
+    /// A fixed-form field had an illegal bit.
+    Form,
+    /// A transmitted frame was not acknowledged.
+    Acknowledgment,
+    /// Sent recessive, read dominant.
+    BitRecessive,
+    /// Sent dominant, read recessive.
+    BitDominant,
+    /// The CRC of a received frame was wrong.
+    Crc,
+}
+
+/// The state of a controller's fault confinement (ISO 11898-1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum ErrorState {
+    /// Error active: both counters below 96.
+    Active,
+    /// A counter reached 96.
+    Warning,
+    /// Error passive: a counter passed 127.
+    Passive,
+    /// The transmit error counter passed 255; the controller is off the bus.
+    BusOff,
+}
+
+/// Why a frame was not sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum TransmitFailure {
+    /// One-shot mode, and arbitration was lost.
+    ArbitrationLost,
+    /// One-shot mode, and an error hit the frame.
+    BusError,
+    /// The host asked for it.
+    Aborted,
+    /// The channel was closed.
+    Closed,
+    /// The controller went bus-off.
+    BusOff,
+}
+
+/// Everything in the stream that is not a received frame. The order of the variants is the wire
+/// format: append only, and at most 64.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Event {
+    /// Frames are missing at this place.
+    Lost {
+        /// The channel they would have come from.
+        channel: Channel,
+        /// The stage that lost them.
+        stage: LossStage,
+        /// How many.
+        count: u32,
+        /// Whether there may have been more (a hardware overrun cannot count).
+        at_least: bool,
+    },
+    /// The controller saw an error on the bus.
+    BusError {
+        /// Where.
+        channel: Channel,
+        /// What.
+        kind: BusErrorKind,
+        /// Transmit error counter after it.
+        tec: u8,
+        /// Receive error counter after it.
+        rec: u8,
+    },
+    /// Bus errors that were counted, but not reported one by one, because there were too many.
+    ErrorsSuppressed {
+        /// Where.
+        channel: Channel,
+        /// How many.
+        count: u32,
+    },
+    /// The controller's fault confinement changed.
+    State {
+        /// Where.
+        channel: Channel,
+        /// The new state.
+        state: ErrorState,
+        /// Transmit error counter.
+        tec: u8,
+        /// Receive error counter.
+        rec: u8,
+    },
+    /// The channel takes part in the bus from here on.
+    Started {
+        /// Which.
+        channel: Channel,
+    },
+    /// The channel was closed: nothing of it follows.
+    Stopped {
+        /// Which.
+        channel: Channel,
+    },
+    /// A frame of ours is on the bus, complete and acknowledged. Its time is the end of the frame.
+    Transmitted {
+        /// Where.
+        channel: Channel,
+        /// The tag from the request (see [`crate::message::TxFrame`]); for frames that the device
+        /// sends by itself, see [`crate::message::DEVICE_TAG`].
+        tag: u32,
+        /// The frame as sent.
+        frame: Frame,
+    },
+    /// A frame was not sent and will not be.
+    TransmitFailed {
+        /// Where.
+        channel: Channel,
+        /// As in [`Event::Transmitted`].
+        tag: u32,
+        /// Why.
+        reason: TransmitFailure,
+    },
+    /// Nothing happened for so long that the next time difference would not fit.
+    TimeMark,
+}
+
+/// One entry of the stream. Its absolute time is the decoder's business.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Record {
+    /// A received frame.
+    Received(Received),
+    /// Anything else.
+    Event(Event),
+}
+
+/// A record cannot be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct BadRecord;
+
+/// Writes a received frame and returns its length. `ticks` is the time since the record before.
+#[inline]
+pub fn encode_received(received: &Received, ticks: i32, out: &mut [u8; MAX_RECORD]) -> usize {
+    let frame = &received.frame;
+    let mut qualifiers = match received.stamp {
+        Stamp::Exact => 0,
+        Stamp::UpperBound => UPPER_BOUND,
+        Stamp::Omitted => NO_STAMP,
+    };
+    if received.data_omitted {
+        qualifiers |= NO_DATA;
+    }
+    let mut len = 0;
+    if qualifiers != 0 {
+        out[0] = QUALIFIED | qualifiers;
+        len = 1;
+    }
+    let id = frame.id();
+    out[len] = FRAME
+        | (received.channel.index() as u8) << 6
+        | u8::from(id.is_extended()) << 5
+        | u8::from(frame.is_remote()) << 4
+        | frame.dlc();
+    len += 1;
+    let raw = id.raw().to_le_bytes();
+    let id_len = if id.is_extended() { 4 } else { 2 };
+    out[len..len + 4].copy_from_slice(&raw);
+    len += id_len;
+    if received.stamp != Stamp::Omitted {
+        len += encode_ticks(ticks, &mut out[len..]);
+    }
+    if !received.data_omitted {
+        let data_len = frame.data_len();
+        out[len..len + 8].copy_from_slice(&frame.padded_data());
+        len += data_len;
+    }
+    len
+}
+
+/// Writes an event and returns its length. `ticks` is the time since the record before.
+pub fn encode_event(event: &Event, ticks: i32, out: &mut [u8; MAX_RECORD]) -> usize {
+    // Cannot fail: the buffer holds the longest event there is (tested below).
+    let len = postcard::to_slice(event, &mut out[..]).map_or(0, |written| written.len());
+    len + encode_ticks(ticks, &mut out[len..])
+}
+
+/// postcard's `i32`.
+#[inline]
+fn encode_ticks(ticks: i32, out: &mut [u8]) -> usize {
+    let mut zigzag = ((ticks << 1) ^ (ticks >> 31)) as u32;
+    let mut len = 0;
+    while zigzag >= 0x80 {
+        out[len] = zigzag as u8 | 0x80;
+        zigzag >>= 7;
+        len += 1;
+    }
+    out[len] = zigzag as u8;
+    len + 1
+}
+
+/// postcard's `i32`, with what follows it.
+#[inline]
+fn decode_ticks(bytes: &[u8]) -> Result<(i32, &[u8]), BadRecord> {
+    // One and two bytes are nearly all there is; postcard takes the rest.
+    let zigzag = match *bytes {
+        [a, ref rest @ ..] if a < 0x80 => (u32::from(a), rest),
+        [a, b, ref rest @ ..] if b < 0x80 => (u32::from(a & 0x7F) | u32::from(b) << 7, rest),
+        _ => return postcard::take_from_bytes(bytes).map_err(|_| BadRecord),
+    };
+    Ok(((zigzag.0 >> 1) as i32 ^ -((zigzag.0 & 1) as i32), zigzag.1))
+}
+
+/// Reads one record: the record, its time difference in ticks, and what follows it.
+#[inline]
+pub fn decode(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
+    let (&first, rest) = bytes.split_first().ok_or(BadRecord)?;
+    if first < QUALIFIED {
+        let (event, rest) = postcard::take_from_bytes::<Event>(bytes).map_err(|_| BadRecord)?;
+        let (ticks, rest) = decode_ticks(rest)?;
+        return Ok((Record::Event(event), ticks, rest));
+    }
+    let (qualifiers, header, rest) = if first >= FRAME {
+        (0, first, rest)
+    } else {
+        let (&header, rest) = rest.split_first().ok_or(BadRecord)?;
+        (first & !QUALIFIER_MASK, header, rest)
+    };
+    let stamp = match qualifiers & (UPPER_BOUND | NO_STAMP) {
+        0 => Stamp::Exact,
+        UPPER_BOUND => Stamp::UpperBound,
+        NO_STAMP => Stamp::Omitted,
+        _ => return Err(BadRecord),
+    };
+    let qualifiers_known = first >= FRAME || first & QUALIFIER_MASK == QUALIFIED && qualifiers != 0;
+    if header < FRAME || !qualifiers_known {
+        return Err(BadRecord);
+    }
+    let (id, rest) = if header & 0x20 == 0 {
+        let (raw, rest) = rest.split_first_chunk::<2>().ok_or(BadRecord)?;
+        (Id::standard(u32::from(u16::from_le_bytes(*raw))), rest)
+    } else {
+        let (raw, rest) = rest.split_first_chunk::<4>().ok_or(BadRecord)?;
+        (Id::extended(u32::from_le_bytes(*raw)), rest)
+    };
+    let id = id.ok_or(BadRecord)?;
+    let (ticks, rest) = if stamp == Stamp::Omitted { (0, rest) } else { decode_ticks(rest)? };
+    let remote = header & 0x10 != 0;
+    let dlc = header & 15;
+    let data_omitted = qualifiers & NO_DATA != 0;
+    let data_len = if remote || data_omitted { 0 } else { dlc.min(8) as usize };
+    let mut data = [0; 8];
+    if rest.len() < data_len {
+        return Err(BadRecord);
+    }
+    let (bytes, rest) = rest.split_at(data_len);
+    data[..data_len].copy_from_slice(bytes);
+    let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
+    let frame = Frame::from_bus(id, remote, dlc, data);
+    Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn id() -> impl Strategy<Value = Id> {
+        prop_oneof![
+            (0..=Id::MAX_STANDARD).prop_map(|raw| Id::standard(raw).unwrap()),
+            (0..=Id::MAX_EXTENDED).prop_map(|raw| Id::extended(raw).unwrap()),
+        ]
+    }
+
+    fn received() -> impl Strategy<Value = Received> {
+        let stamp = prop_oneof![Just(Stamp::Exact), Just(Stamp::UpperBound), Just(Stamp::Omitted)];
+        (id(), any::<bool>(), any::<bool>(), 0..16u8, any::<[u8; 8]>(), stamp, any::<bool>()).prop_map(
+            |(id, second, remote, dlc, data, stamp, data_omitted)| Received {
+                channel: Channel::ALL[usize::from(second)],
+                frame: Frame::from_bus(id, remote, dlc, if data_omitted { [0; 8] } else { data }),
+                stamp,
+                data_omitted,
+            },
+        )
+    }
+
+    proptest! {
+        #[test]
+        fn any_frame_round_trips(received in received(), ticks: i32, tail: Vec<u8>) {
+            let mut out = [0; MAX_RECORD];
+            let len = encode_received(&received, ticks, &mut out);
+            prop_assert!(len <= MAX_FRAME_RECORD);
+            let mut bytes = out[..len].to_vec();
+            bytes.extend_from_slice(&tail);
+            let ticks = if received.stamp == Stamp::Omitted { 0 } else { ticks };
+            prop_assert_eq!(decode(&bytes), Ok((Record::Received(received), ticks, &tail[..])));
+        }
+
+        #[test]
+        fn any_bytes_decode_or_are_refused(bytes: Vec<u8>) {
+            if let Ok((_, _, rest)) = decode(&bytes) {
+                prop_assert!(rest.len() < bytes.len());
+            }
+        }
+    }
+
+    #[test]
+    fn the_longest_event_fits() {
+        let frame = Frame::data_frame(Id::extended(Id::MAX_EXTENDED).unwrap(), &[0xFF; 8]).unwrap();
+        let event = Event::Transmitted { channel: Channel::Can2, tag: u32::MAX, frame };
+        let mut out = [0; MAX_RECORD];
+        let len = encode_event(&event, i32::MIN, &mut out);
+        assert_eq!(len, MAX_RECORD);
+        assert_eq!(decode(&out), Ok((Record::Event(event), i32::MIN, &[][..])));
+    }
+}

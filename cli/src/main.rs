@@ -1,2 +1,36 @@
-//! The cantap command.
-fn main() {}
+//! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
+
+mod commands;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// Exit codes beside 0 (success). Documented in `cantap --help`.
+mod exit {
+    /// Something failed; the message on stderr says what and what to do next.
+    pub const FAILURE: u8 = 1;
+    // 2 is a wrong command line; clap uses it by itself.
+}
+
+/// Captures, understands and drives CAN buses with a cantap analyser.
+#[derive(Parser)]
+#[command(
+    name = "cantap",
+    version,
+    after_help = "Exit codes: 0 success, 1 failure, 2 wrong command line, 3 a check did not hold."
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: commands::Command,
+}
+
+fn main() -> ExitCode {
+    match Cli::parse().command.run() {
+        Ok(code) => code,
+        Err(error) => {
+            eprintln!("cantap: {error:#}");
+            ExitCode::from(exit::FAILURE)
+        }
+    }
+}

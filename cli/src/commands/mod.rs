@@ -1,0 +1,21 @@
+//! The subcommands. Each file has an `Args` for its command line and a `run`.
+
+pub mod bits;
+
+use std::process::ExitCode;
+
+/// One subcommand.
+#[derive(clap::Subcommand)]
+pub enum Command {
+    /// Show a frame's exact length on the bus, stuff bits and CRC.
+    Bits(bits::Args),
+}
+
+impl Command {
+    /// Runs it.
+    pub fn run(self) -> anyhow::Result<ExitCode> {
+        match self {
+            Self::Bits(args) => bits::run(&args),
+        }
+    }
+}

@@ -1,5 +1,6 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
 
+mod args;
 mod commands;
 
 use std::process::ExitCode;

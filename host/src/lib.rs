@@ -1,8 +1,10 @@
 //! The cantap host library: devices, records, time, statistics; trace files and signals behind
 //! features, so that a program that only captures stays small.
 
+pub mod bits;
 pub mod trace;
 
+pub use bits::{FrameBits, bits_on_bus};
 pub use cantap_wire as wire;
 pub use cantap_wire::{Channel, Frame, Id};
 pub use trace::{Direction, TraceEvent, TraceRecord};

@@ -1,1 +1,16 @@
-//! The emulated board.
+//! The emulated board: an STM32F405 that runs the unmodified firmware ELF instruction by instruction,
+//! with two CAN buses and a USB host attached.
+//!
+//! It depends on the wire protocol's types and never on the firmware's library: it is an independent
+//! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
+//! here looks at the host's clock, so the same seed gives the same run, byte for byte.
+
+pub mod peripheral;
+
+pub use peripheral::Peripheral;
+
+/// Core cycles per emulated second: the firmware's SYSCLK of 144 MHz. The few microseconds before the
+/// firmware switches to its PLL are counted in the same unit.
+pub const CYCLES_PER_SECOND: u64 = 144_000_000;
+/// Core cycles per emulated microsecond.
+pub const CYCLES_PER_US: u64 = CYCLES_PER_SECOND / 1_000_000;

@@ -185,7 +185,7 @@ mod tests {
         let mut crc: u16 = 0;
         for bit in &bits {
             let feedback = *bit as u16 ^ crc >> 14 & 1;
-            crc = crc << 1 & 0x7FFF ^ feedback * 0x4599;
+            crc = (crc << 1 & 0x7FFF) ^ (feedback * 0x4599);
         }
         bits.extend((0..15).rev().map(|bit| u32::from(crc >> bit & 1)));
         let unstuffed = bits.len() as u32 + 1 + 2 + 7 + 3;

@@ -1,5 +1,6 @@
 //! `cantap bits`: a frame's exact length on the bus.
 
+use std::io::Write;
 use std::process::ExitCode;
 
 use cantap::{Frame, FrameBits};
@@ -27,8 +28,10 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let bits = FrameBits::of(&args.frame);
     let duration_us = bits.duration_ns(args.bitrate) as f64 / 1e3;
+    let mut out = std::io::stdout().lock();
     if args.json {
-        println!(
+        writeln!(
+            out,
             "{}",
             serde_json::json!({
                 "frame": args.frame.to_string(),
@@ -39,14 +42,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 "bitrate_bps": args.bitrate,
                 "duration_us": duration_us,
             })
-        );
+        )?;
     } else {
-        println!("frame       {}", args.frame);
-        println!("length      {} bits, intermission included", bits.total());
-        println!("frame bits  {}", bits.unstuffed);
-        println!("stuff bits  {}", bits.stuff);
-        println!("CRC         0x{:03X}", bits.crc);
-        println!("duration    {duration_us} us at {} bit/s", args.bitrate);
+        writeln!(out, "frame       {}", args.frame)?;
+        writeln!(out, "length      {} bits, intermission included", bits.total())?;
+        writeln!(out, "frame bits  {}", bits.unstuffed)?;
+        writeln!(out, "stuff bits  {}", bits.stuff)?;
+        writeln!(out, "CRC         0x{:03X}", bits.crc)?;
+        writeln!(out, "duration    {duration_us} us at {} bit/s", args.bitrate)?;
     }
     Ok(ExitCode::SUCCESS)
 }

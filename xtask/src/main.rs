@@ -1,2 +1,61 @@
-//! The project's own build steps.
-fn main() {}
+//! The project's own build steps: `cargo xtask firmware | test | size | bench | soak | dist`.
+//!
+//! Kept light, because `cargo fw` builds it first: what only the benchmarks need hides behind a feature.
+
+mod bench;
+mod board;
+mod dist;
+mod firmware;
+mod peers;
+mod reproducible;
+mod size;
+mod soak;
+mod test;
+mod toolchain;
+mod workspace;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// The project's own build steps.
+#[derive(Parser)]
+#[command(name = "cargo xtask", bin_name = "cargo xtask", version)]
+struct Cli {
+    #[command(subcommand)]
+    task: Task,
+}
+
+#[derive(Subcommand)]
+enum Task {
+    /// Builds the firmware into `target/firmware/cantap-BOARD.elf` (also `cargo fw`).
+    Firmware(firmware::Args),
+    /// Does everything that must hold before a change lands, from a fresh clone on.
+    Test(test::Args),
+    /// Prints each board's flash and static RAM, and fails past `size-budget.toml`.
+    Size,
+    /// Measures speed and size.
+    Bench(bench::Args),
+    /// Runs the firmware on the emulated board for a long time, with a new seed for each run.
+    Soak(soak::Args),
+    /// Packs the release archives: the command, and each board's firmware.
+    Dist,
+}
+
+fn main() -> ExitCode {
+    let result = match Cli::parse().task {
+        Task::Firmware(args) => firmware::run(&args),
+        Task::Test(args) => test::run(&args),
+        Task::Size => size::run(),
+        Task::Bench(args) => bench::run(&args),
+        Task::Soak(args) => soak::run(&args),
+        Task::Dist => dist::run(),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("xtask: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}

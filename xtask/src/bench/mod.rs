@@ -1,0 +1,53 @@
+//! `cargo xtask bench`: measures, and says against what.
+//!
+//! Figures only mean something in a release build, so this builds itself again in one, with what the measurements
+//! need. One file per subject; each has `run()`, which prints its own table.
+
+#[cfg(feature = "bench")]
+mod wire;
+
+use anyhow::Result;
+#[cfg(not(feature = "bench"))]
+use xshell::cmd;
+
+/// What is measured.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Subject {
+    /// Bytes per frame on the wire, and the encoder's cost.
+    Wire,
+}
+
+/// What `cargo xtask bench` takes.
+#[derive(clap::Args)]
+pub struct Args {
+    /// What to measure; everything if not given.
+    subject: Vec<Subject>,
+}
+
+/// Builds this program in release and measures there.
+#[cfg(not(feature = "bench"))]
+pub fn run(args: &Args) -> Result<()> {
+    use clap::ValueEnum;
+
+    let shell = crate::workspace::shell()?;
+    let subjects = args.subject.iter().filter_map(Subject::to_possible_value);
+    let subjects: Vec<String> = subjects.map(|subject| subject.get_name().to_owned()).collect();
+    cmd!(shell, "cargo run --release --quiet -p xtask --features bench -- bench {subjects...}")
+        .quiet()
+        .run()?;
+    Ok(())
+}
+
+/// Measures.
+#[cfg(feature = "bench")]
+pub fn run(args: &Args) -> Result<()> {
+    use clap::ValueEnum;
+
+    let subjects = if args.subject.is_empty() { Subject::value_variants() } else { &args.subject };
+    for subject in subjects {
+        match subject {
+            Subject::Wire => wire::run()?,
+        }
+    }
+    Ok(())
+}

@@ -1,0 +1,69 @@
+//! `cargo xtask firmware`: builds the ELF that is flashed.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use xshell::Shell;
+
+use crate::board::Board;
+use crate::toolchain::{TARGET, Toolchain};
+use crate::workspace;
+
+/// What `cargo xtask firmware` takes.
+#[derive(clap::Args)]
+pub struct Args {
+    /// The board to build for.
+    #[arg(long, default_value = "olimex-p405", conflicts_with = "all")]
+    board: Board,
+    /// Build for every board.
+    #[arg(long)]
+    all: bool,
+}
+
+/// Builds for one board or all.
+pub fn run(args: &Args) -> Result<()> {
+    let shell = workspace::shell()?;
+    let toolchain = Toolchain::find(&shell)?;
+    let boards = if args.all { &Board::ALL[..] } else { &[args.board] };
+    build_all(&shell, toolchain, boards)
+}
+
+/// Builds for `boards` and puts each ELF in its place.
+pub fn build_all(shell: &Shell, toolchain: Toolchain, boards: &[Board]) -> Result<()> {
+    shell.create_dir(workspace::firmware_dir())?;
+    for board in boards {
+        let built = build(shell, toolchain, *board, &target_dir())?;
+        shell.copy_file(built, board.elf())?;
+        println!("{}", board.elf().display());
+    }
+    Ok(())
+}
+
+/// Builds for one board with its own target directory and returns cargo's ELF.
+pub fn build(shell: &Shell, toolchain: Toolchain, board: Board, target_dir: &Path) -> Result<PathBuf> {
+    let feature = board.name();
+    toolchain
+        .cargo(shell, "build", target_dir)?
+        .args(["--profile", "firmware", "-p", "cantap-firmware", "--bin", "cantap-firmware"])
+        .args(["--no-default-features", "--features", feature])
+        .run()?;
+    Ok(target_dir.join(TARGET).join("firmware/cantap-firmware"))
+}
+
+/// Lints the firmware as each board compiles it, which a lint on the host cannot see.
+pub fn clippy(shell: &Shell, toolchain: Toolchain) -> Result<()> {
+    for board in Board::ALL {
+        let feature = board.name();
+        toolchain
+            .cargo(shell, "clippy", &target_dir())?
+            .args(["-p", "cantap-firmware", "--no-default-features", "--features", feature])
+            .args(["--", "-D", "warnings"])
+            .run()?;
+    }
+    Ok(())
+}
+
+/// Apart from the host's builds, because Debian's compiler is another version.
+pub fn target_dir() -> PathBuf {
+    workspace::target().join("fw")
+}

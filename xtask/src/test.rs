@@ -1,0 +1,114 @@
+//! `cargo xtask test`: everything that must hold before a change lands, from a fresh clone on.
+
+use std::time::{Duration, Instant};
+
+use anyhow::{Result, ensure};
+use xshell::{Cmd, Shell, cmd};
+
+use crate::board::Board;
+use crate::peers::Peers;
+use crate::toolchain::Toolchain;
+use crate::{firmware, reproducible, size, workspace};
+
+/// What `cargo xtask test` takes.
+#[derive(clap::Args)]
+pub struct Args {
+    /// Only this step; may be given again. Later steps use the firmware that earlier ones built.
+    #[arg(long, value_name = "STEP")]
+    only: Vec<Step>,
+}
+
+/// One thing that is checked. The order is the order of the run: what fails fast comes first.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Step {
+    /// Formatting.
+    Fmt,
+    /// The firmware of every board.
+    Firmware,
+    /// What the firmware takes, against its budget.
+    Size,
+    /// A second build, elsewhere, gives the same bytes.
+    Reproducible,
+    /// Lints of everything for the host.
+    Clippy,
+    /// Lints of the firmware for each board.
+    ClippyFirmware,
+    /// The tests that need no firmware ELF.
+    Host,
+    /// The tests that run the firmware ELF on the emulated board.
+    Emulated,
+    /// Public items' documentation, with every link checked.
+    Doc,
+}
+
+/// Runs the steps one after the other and stops at the first that fails.
+pub fn run(args: &Args) -> Result<()> {
+    use clap::ValueEnum;
+
+    let steps = if args.only.is_empty() { Step::value_variants() } else { &args.only };
+    let shell = workspace::shell()?;
+    let toolchain = Toolchain::find_or_install(&shell)?;
+    let peers = Peers::find_or_install(&shell)?;
+    let mut done: Vec<(String, Duration)> = Vec::new();
+    for step in steps {
+        let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
+        println!("\n--- {name}");
+        let begin = Instant::now();
+        let result = step.run(&shell, toolchain, peers.as_ref());
+        if let Err(error) = result {
+            report(&done);
+            eprintln!("{name:<16} failed; to repeat it: cargo xtask test --only {name}");
+            return Err(error);
+        }
+        done.push((name, begin.elapsed()));
+    }
+    println!();
+    report(&done);
+    Ok(())
+}
+
+impl Step {
+    fn run(self, shell: &Shell, toolchain: Toolchain, peers: Option<&Peers>) -> Result<()> {
+        match self {
+            Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
+            Step::Firmware => firmware::build_all(shell, toolchain, &Board::ALL)?,
+            Step::Size => size::run()?,
+            Step::Reproducible => reproducible::check(shell, toolchain)?,
+            Step::Clippy => {
+                cmd!(shell, "cargo clippy --locked --workspace --all-targets --all-features -- -D warnings")
+                    .run()?;
+            }
+            Step::ClippyFirmware => firmware::clippy(shell, toolchain)?,
+            Step::Host => {
+                let test = cmd!(shell, "cargo test --locked --workspace --all-features --exclude cantap-sim");
+                with_peers(test, peers).run()?;
+            }
+            Step::Emulated => {
+                let elf = Board::ALL[0].elf();
+                ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
+                let test = cmd!(shell, "cargo test --locked -p cantap-sim --all-features");
+                with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
+            }
+            Step::Doc => {
+                cmd!(shell, "cargo doc --locked --workspace --no-deps --all-features")
+                    .env("RUSTDOCFLAGS", "-D warnings")
+                    .run()?;
+            }
+        }
+        Ok(())
+    }
+}
+
+/// Tells the tests where the peers are and that they must not skip them.
+fn with_peers<'a>(cmd: Cmd<'a>, peers: Option<&Peers>) -> Cmd<'a> {
+    match peers {
+        Some(peers) => cmd.env("CANTAP_PYTHON", &peers.python).env("CANTAP_REQUIRE_PEERS", "1"),
+        None => cmd,
+    }
+}
+
+fn report(done: &[(String, Duration)]) {
+    for (name, time) in done {
+        println!("{name:<16} ok {:>6.1} s", time.as_secs_f64());
+    }
+}

@@ -1,0 +1,137 @@
+//! Finds a compiler for the chip.
+//!
+//! An ordinary rustup has the target's standard library, because `rust-toolchain.toml` names it. Where it is
+//! absent and cannot be fetched, Debian's packaged toolchain builds `core` from its own source. Core's source
+//! must be the compiler's own version, so the two toolchains' parts are never mixed.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, bail};
+use xshell::{Cmd, Shell, cmd};
+
+/// The chip's target: Cortex-M4 with its FPU.
+pub const TARGET: &str = "thumbv7em-none-eabihf";
+
+const DEBIAN_CARGO: &str = "/usr/bin/cargo";
+const DEBIAN_RUSTC: &str = "/usr/bin/rustc";
+const DEBIAN_LINKER: &str = "/usr/bin/ld.lld";
+const DEBIAN_CLIPPY: &str = "/usr/bin/clippy-driver";
+
+/// Debian's packages with a compiler that can build `core`, its source, a linker, and the lints.
+const DEBIAN_PACKAGES: [&str; 5] = ["rustc-web", "cargo-web", "rust-web-src", "lld", "rust-web-clippy"];
+
+/// A way to build for the chip.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Toolchain {
+    /// The toolchain that builds everything else, with the target's standard library.
+    Rustup,
+    /// Debian's, with `core` built from source.
+    Debian,
+}
+
+impl Toolchain {
+    /// The toolchain that is here.
+    pub fn find(shell: &Shell) -> Result<Self> {
+        if sysroot(shell, "rustc")?.join("lib/rustlib").join(TARGET).join("lib").is_dir() {
+            return Ok(Toolchain::Rustup);
+        }
+        let tools = [DEBIAN_CARGO, DEBIAN_RUSTC, DEBIAN_LINKER, DEBIAN_CLIPPY];
+        if tools.iter().all(|tool| Path::new(tool).exists()) {
+            let library = sysroot(shell, DEBIAN_RUSTC)?.join("lib/rustlib/src/rust/library/core");
+            if library.is_dir() {
+                return Ok(Toolchain::Debian);
+            }
+        }
+        let debian = DEBIAN_PACKAGES.join(" ");
+        bail!(
+            "no compiler for {TARGET}; run `rustup target add {TARGET}`, or on Debian `apt-get install {debian}`"
+        )
+    }
+
+    /// As [`Self::find`], but on Debian, as root, installs what is missing.
+    pub fn find_or_install(shell: &Shell) -> Result<Self> {
+        match Self::find(shell) {
+            Ok(toolchain) => Ok(toolchain),
+            Err(error) if can_install() => {
+                eprintln!("{error}; installing Debian's");
+                install(shell, &DEBIAN_PACKAGES)?;
+                Self::find(shell)
+            }
+            Err(error) => Err(error),
+        }
+    }
+
+    /// `cargo SUBCOMMAND` for the chip. Paths of this machine do not get into what it builds.
+    pub fn cargo<'a>(self, shell: &'a Shell, subcommand: &str, target_dir: &Path) -> Result<Cmd<'a>> {
+        let (cargo, rustc) = match self {
+            Toolchain::Rustup => ("cargo", "rustc"),
+            Toolchain::Debian => (DEBIAN_CARGO, DEBIAN_RUSTC),
+        };
+        let mut cmd =
+            cmd!(shell, "{cargo} {subcommand} --locked --target {TARGET} --target-dir {target_dir}")
+                .env("CARGO_ENCODED_RUSTFLAGS", remaps(shell, &sysroot(shell, rustc)?)?);
+        if self == Toolchain::Debian {
+            // Unstable only in name: it lets the packaged stable compiler build `core`.
+            cmd = cmd
+                .arg("-Zbuild-std=core")
+                .env("RUSTC", DEBIAN_RUSTC)
+                .env("RUSTC_BOOTSTRAP", "1")
+                // `cargo clippy` takes the first cargo-clippy of the path, which must be of the same compiler.
+                .env("PATH", debian_first()?)
+                .env("CARGO_TARGET_THUMBV7EM_NONE_EABIHF_LINKER", "ld.lld")
+                .env_remove("RUSTUP_TOOLCHAIN")
+                .env_remove("RUSTC_WRAPPER");
+        }
+        Ok(cmd)
+    }
+}
+
+/// The path, with Debian's programs before all others.
+fn debian_first() -> Result<std::ffi::OsString> {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    Ok(std::env::join_paths(std::iter::once(PathBuf::from("/usr/bin")).chain(std::env::split_paths(&path)))?)
+}
+
+/// Whether packages can be installed here without asking anybody.
+pub fn can_install() -> bool {
+    let is_root = std::process::Command::new("id").arg("-u").output().is_ok_and(|id| id.stdout == b"0\n");
+    is_root && Path::new("/etc/debian_version").exists()
+}
+
+/// Installs Debian packages.
+pub fn install(shell: &Shell, packages: &[&str]) -> Result<()> {
+    cmd!(shell, "apt-get -q update").env("DEBIAN_FRONTEND", "noninteractive").run()?;
+    cmd!(shell, "apt-get -q install -y --no-install-recommends {packages...}")
+        .env("DEBIAN_FRONTEND", "noninteractive")
+        .run()?;
+    Ok(())
+}
+
+fn sysroot(shell: &Shell, rustc: &str) -> Result<PathBuf> {
+    Ok(cmd!(shell, "{rustc} --print sysroot").quiet().read()?.into())
+}
+
+/// Compiler flags, as `CARGO_ENCODED_RUSTFLAGS` wants them, that replace this machine's directories.
+fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
+    let home = std::env::var_os("CARGO_HOME")
+        .map(PathBuf::from)
+        .or_else(|| std::env::home_dir().map(|home| home.join(".cargo")))
+        .context("neither CARGO_HOME nor a home directory is known; set CARGO_HOME")?;
+    // The compiler takes the last flag that matches, so the most specific ones stand last.
+    let mut flags = vec![remap(&home, "/cargo")];
+    // A registry's directory is named by the place it was fetched from, which is not the source's business.
+    if let Ok(registries) = shell.read_dir(home.join("registry/src")) {
+        flags.extend(registries.iter().map(|registry| remap(registry, "/crates")));
+    }
+    let library = sysroot.join("lib/rustlib/src/rust");
+    if let Ok(library) = library.canonicalize() {
+        flags.push(remap(&library, "/rust"));
+    }
+    flags.push(remap(&library, "/rust"));
+    flags.push(remap(&shell.current_dir(), "/cantap"));
+    Ok(flags.join("\x1f"))
+}
+
+fn remap(from: &Path, to: &str) -> String {
+    format!("--remap-path-prefix={}={to}", from.display())
+}

@@ -1,0 +1,29 @@
+//! Where things are in the source tree, and a shell that stands there.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use xshell::Shell;
+
+/// The workspace's root directory.
+pub fn root() -> PathBuf {
+    let xtask = Path::new(env!("CARGO_MANIFEST_DIR"));
+    xtask.parent().map_or_else(|| xtask.to_owned(), Path::to_owned)
+}
+
+/// Where cargo puts what it builds for the host.
+pub fn target() -> PathBuf {
+    std::env::var_os("CARGO_TARGET_DIR").map_or_else(|| root().join("target"), PathBuf::from)
+}
+
+/// Where the finished firmware lies.
+pub fn firmware_dir() -> PathBuf {
+    target().join("firmware")
+}
+
+/// A shell in the workspace's root.
+pub fn shell() -> Result<Shell> {
+    let shell = Shell::new().context("there is no current directory")?;
+    shell.change_dir(root());
+    Ok(shell)
+}

@@ -106,8 +106,10 @@ pub enum TransmitFailure {
     Aborted,
     /// The channel was closed.
     Closed,
-    /// The controller went bus-off.
+    /// The controller went bus-off and recovery is manual.
     BusOff,
+    /// A periodic frame's period passed again before the bus took it.
+    Overtaken,
 }
 
 /// Everything in the stream that is not a received frame. The order of the variants is the wire

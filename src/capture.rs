@@ -1,0 +1,308 @@
+//! What the highest-priority interrupts do: receive, transmit, errors, alarm.
+//!
+//! The receive interrupt stamps before anything else. A single frame in the FIFO is the one that raised the
+//! interrupt, so its stamp is its end plus the interrupt's latency. Frames found queued behind one
+//! another ended at unknown times before now: their stamp says so, and the host tightens it.
+
+use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
+use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
+use cantap_wire::{CHANNELS, Channel, Event, Received};
+
+use crate::QUEUE_BYTES;
+use crate::errors::ErrorMonitor;
+use crate::ports::{Clock, Traffic};
+use crate::queue::Producer;
+use crate::recorder::Recorder;
+use crate::transmit::Transmitter;
+
+/// An alarm is never set farther ahead than this, a quarter of the timer's range; it is set again then.
+const ALARM_AHEAD_TICKS: u64 = 1 << 30;
+
+/// One channel's state.
+struct ChannelState {
+    open: Option<ChannelConfig>,
+    /// Why its transmissions are aborted, if they are.
+    abort_reason: TransmitFailure,
+    frames: u32,
+    overruns: u32,
+    errors: ErrorMonitor,
+    transmitter: Transmitter,
+}
+
+/// Everything the highest-priority interrupts share.
+pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
+    recorder: Recorder<'q, N>,
+    channels: [ChannelState; CHANNELS],
+}
+
+impl<'q, const N: usize> Capture<'q, N> {
+    /// Both channels closed.
+    #[expect(clippy::large_stack_arrays, reason = "built once, at start, into its static place")]
+    pub const fn new(producer: Producer<'q, N>) -> Self {
+        const fn state(channel: Channel) -> ChannelState {
+            ChannelState {
+                open: None,
+                abort_reason: TransmitFailure::Aborted,
+                frames: 0,
+                overruns: 0,
+                errors: ErrorMonitor::new(channel),
+                transmitter: Transmitter::new(channel),
+            }
+        }
+        Self { recorder: Recorder::new(producer), channels: [state(Channel::Can1), state(Channel::Can2)] }
+    }
+
+    /// The receive interrupt. `entered` is the clock, read before anything else.
+    #[inline]
+    pub fn on_receive(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        entered: u32,
+    ) {
+        let state = &mut self.channels[channel.index()];
+        let (omit_data, omit_stamps) = match &state.open {
+            Some(config) => (config.omit_data, config.omit_stamps),
+            None => (false, false),
+        };
+        let mut stamp = entered;
+        let mut reply = false;
+        loop {
+            let pending = traffic.pending();
+            let overrun = traffic.take_overrun();
+            if pending == 0 && !overrun {
+                break;
+            }
+            let mut quality = Stamp::Exact;
+            if pending > 1 {
+                // The last of them may have ended after the interrupt was entered.
+                stamp = clock.now();
+                quality = Stamp::UpperBound;
+            }
+            let at = self.recorder.time(stamp);
+            for _ in 0..pending {
+                let Some(frame) = traffic.receive() else { break };
+                state.frames = state.frames.wrapping_add(1);
+                reply |= state.transmitter.on_frame(&frame);
+                let received = Received {
+                    channel,
+                    frame,
+                    stamp: if omit_stamps { Stamp::Omitted } else { quality },
+                    data_omitted: omit_data,
+                };
+                self.recorder.frame(&received, at);
+            }
+            if overrun {
+                // The FIFO kept the frames before and dropped those after.
+                state.overruns = state.overruns.wrapping_add(1);
+                let lost = Event::Lost { channel, stage: LossStage::Controller, count: 1, at_least: true };
+                self.recorder.event(&lost, at);
+            }
+            stamp = clock.now();
+        }
+        if reply {
+            let now = self.recorder.time(clock.now());
+            state.transmitter.service(traffic, &mut self.recorder, now);
+        }
+    }
+
+    /// The transmit interrupt: a mailbox has finished.
+    pub fn on_transmit(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        entered: u32,
+    ) {
+        let now = self.recorder.time(entered);
+        let state = &mut self.channels[channel.index()];
+        state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+        self.arm(clock);
+    }
+
+    /// The error interrupt.
+    pub fn on_error(&mut self, channel: Channel, traffic: &mut impl Traffic, entered: u32) {
+        let now = self.recorder.time(entered);
+        let state = &mut self.channels[channel.index()];
+        state.errors.update(traffic, &mut self.recorder, now);
+        Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+    }
+
+    /// The alarm: something is due for transmission.
+    pub fn on_alarm<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+        let now = self.recorder.time(clock.now());
+        for (state, traffic) in self.channels.iter_mut().zip(traffic) {
+            if state.open.is_some() {
+                state.transmitter.service(traffic, &mut self.recorder, now);
+            }
+        }
+        self.arm(clock);
+    }
+
+    /// Once a millisecond: keeps time going, reads what no interrupt tells, retries what found no room.
+    pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+        let now = self.recorder.time(clock.now());
+        let mut any_open = false;
+        for (state, traffic) in self.channels.iter_mut().zip(traffic) {
+            if state.open.is_some() {
+                any_open = true;
+                state.errors.update(traffic, &mut self.recorder, now);
+                state.errors.tick(&mut self.recorder, now);
+                Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+                state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+            }
+        }
+        if any_open {
+            self.recorder.tick(now);
+            self.arm(clock);
+        }
+    }
+
+    /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame.
+    fn give_up_when_off(
+        state: &mut ChannelState,
+        traffic: &mut impl Traffic,
+        recorder: &mut Recorder<'_, N>,
+        now: u64,
+    ) {
+        let off = state.errors.status().state == cantap_wire::record::ErrorState::BusOff;
+        if off && state.open.is_some_and(|config| config.manual_recovery) && state.transmitter.pending() > 0 {
+            state.abort_reason = TransmitFailure::BusOff;
+            state.transmitter.drop_all(TransmitFailure::BusOff, traffic);
+            state.transmitter.on_finished(traffic, recorder, now, state.abort_reason);
+        }
+    }
+
+    /// Sets the alarm for what is due next.
+    pub fn arm(&mut self, clock: &impl Clock) {
+        let due = self.channels.iter().filter(|state| state.open.is_some());
+        let due = due.filter_map(|state| state.transmitter.next_due()).min();
+        let now = self.recorder.time(clock.now());
+        clock.set_alarm(due.map(|due| due.min(now + ALARM_AHEAD_TICKS) as u32));
+    }
+
+    /// The 64-bit time now.
+    pub fn now(&mut self, clock: &impl Clock) -> u64 {
+        self.recorder.time(clock.now())
+    }
+
+    /// Starts a session: counters at zero. Both channels are closed and the queue is empty.
+    pub fn restart(&mut self, clock: &impl Clock) {
+        let now = self.now(clock);
+        self.recorder.restart(now);
+        for state in &mut self.channels {
+            state.frames = 0;
+            state.overruns = 0;
+            state.errors = ErrorMonitor::new(state.errors.channel());
+            state.transmitter.clear();
+            state.transmitter.reset_counters();
+        }
+    }
+
+    /// The channel is about to join the bus.
+    pub fn open(&mut self, channel: Channel, config: ChannelConfig, clock: &impl Clock) {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        state.open = Some(config);
+        state.abort_reason = TransmitFailure::Aborted;
+        state.errors.restart();
+        self.recorder.event(&Event::Started { channel }, now);
+    }
+
+    /// First half of closing: gives up transmissions. The channel is still on the bus.
+    pub fn begin_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        state.abort_reason = TransmitFailure::Closed;
+        state.transmitter.clear_entries();
+        state.transmitter.drop_all(TransmitFailure::Closed, traffic);
+        state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+    }
+
+    /// Second half of closing: the channel has left the bus. Records the rest and returns true; or
+    /// false if the queue has no room for it yet.
+    pub fn finish_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
+        let entered = clock.now();
+        self.on_receive(channel, traffic, clock, entered);
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+        state.errors.flush(&mut self.recorder, now);
+        self.recorder.flush_losses(now);
+        if !state.transmitter.is_idle() || !self.recorder.event(&Event::Stopped { channel }, now) {
+            return false;
+        }
+        state.open = None;
+        self.arm(clock);
+        true
+    }
+
+    /// The channel has left the bus and nobody listens: forgets it, unrecorded.
+    pub fn abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
+        while traffic.receive().is_some() {}
+        traffic.take_overrun();
+        while traffic.take_finished().is_some() {}
+        let state = &mut self.channels[channel.index()];
+        state.transmitter.clear();
+        state.open = None;
+    }
+
+    /// How the channel is open, if it is.
+    pub const fn config(&self, channel: Channel) -> Option<&ChannelConfig> {
+        self.channels[channel.index()].open.as_ref()
+    }
+
+    /// The channel's transmissions; call [`Self::kick`] afterwards.
+    pub const fn transmitter(&mut self, channel: Channel) -> &mut Transmitter {
+        &mut self.channels[channel.index()].transmitter
+    }
+
+    /// Sends what is due, after a change to [`Self::transmitter`].
+    pub fn kick(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        state.transmitter.service(traffic, &mut self.recorder, now);
+        self.arm(clock);
+    }
+
+    /// Gives up everything queued for transmission.
+    pub fn abort(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        let state = &mut self.channels[channel.index()];
+        state.abort_reason = TransmitFailure::Aborted;
+        state.transmitter.drop_all(TransmitFailure::Aborted, traffic);
+        self.kick(channel, traffic, clock);
+    }
+
+    /// The channel's part of the status.
+    pub fn status(&self, channel: Channel) -> ChannelStatus {
+        let state = &self.channels[channel.index()];
+        let errors = state.errors.status();
+        let (transmitted, transmit_failures) = state.transmitter.counters();
+        ChannelStatus {
+            open: state.open,
+            state: errors.state,
+            tec: errors.tec,
+            rec: errors.rec,
+            last_error: state.errors.last_error(),
+            frames: state.frames,
+            lost_controller: state.overruns,
+            lost_queue: self.recorder.lost(channel),
+            bus_errors: state.errors.errors(),
+            transmitted,
+            transmit_failures,
+            tx_pending: state.transmitter.pending() as u16,
+        }
+    }
+
+    /// The controller's registers now and at the last error.
+    pub fn registers(&self, channel: Channel, traffic: &impl Traffic) -> Registers {
+        let at_last_error = self.channels[channel.index()].errors.registers();
+        Registers { now: traffic.registers(), at_last_error }
+    }
+
+    /// Bytes in the queue, and the most there ever were.
+    pub fn fill(&self) -> (u32, u32) {
+        self.recorder.fill()
+    }
+}

@@ -1,0 +1,479 @@
+//! Does what a host asks. Commands that must wait for a controller become [`Work`], which is looked
+//! after at each poll; nothing here blocks.
+
+use cantap_wire::message::{
+    ChannelConfig, DEVICE_TAG, Filter, MAX_FILTERS, MAX_SEND, Periodic, Status, Trigger, TxFrame, capability,
+};
+use cantap_wire::{CHANNELS, Channel, Command, Frame, Hello, PROTOCOL_VERSION, Refusal, Reply};
+use heapless::{String, Vec};
+use serde::{Deserialize, Serialize};
+
+use crate::filters::{BANKS, Layout};
+use crate::ports::{Board, Chip, Control, FilterBanks};
+use crate::transmit::{self, PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
+use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
+
+/// Most bytes that [`Chip::save`] must hold.
+pub const MAX_SAVED: usize = 2048;
+/// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After so long the
+/// bus is stuck, and the controller is made to leave.
+const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
+/// Time for the answer to reach the host before the device restarts.
+const LEAVE_AFTER_TICKS: u32 = 50 * TICKS_PER_MS;
+/// Target times may be so far ahead: a day.
+const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;
+
+/// Who a device is.
+#[derive(Clone, Debug)]
+pub struct Identity {
+    /// Board name.
+    pub board: &'static str,
+    /// Serial number.
+    pub serial: String<24>,
+}
+
+/// One channel's settings, applied or saved.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+struct ChannelSettings {
+    config: Option<ChannelConfig>,
+    filters: Vec<Filter, MAX_FILTERS>,
+}
+
+/// Something that takes more than one poll.
+#[derive(Clone, Copy, Debug)]
+pub enum Work {
+    /// Both channels leave the bus and everything is forgotten: a session begins or ends.
+    Silence,
+    /// A channel joins the bus.
+    Open(Channel, ChannelConfig),
+    /// A channel leaves the bus and says so in the stream.
+    Close(Channel),
+    /// A channel leaves the bus and joins it again.
+    Recover(Channel),
+    /// The firmware ends.
+    Restart,
+    /// The firmware ends, and the bootloader begins.
+    Bootloader,
+}
+
+/// What a command comes to at once.
+pub enum Step {
+    /// It is done.
+    Done(Reply),
+    /// It has begun.
+    Begun(Work),
+}
+
+/// What commands have set.
+pub struct Commands {
+    identity: Identity,
+    layout: Layout,
+    settings: [ChannelSettings; CHANNELS],
+    /// When the work under way was begun.
+    begun: u32,
+    /// Requests that could not be read.
+    pub bad_requests: u32,
+}
+
+impl Commands {
+    /// Nothing set.
+    pub const fn new(identity: Identity) -> Self {
+        const NOTHING: ChannelSettings = ChannelSettings { config: None, filters: Vec::new() };
+        Self { identity, layout: Layout::open(), settings: [NOTHING; CHANNELS], begun: 0, bad_requests: 0 }
+    }
+
+    /// What [`Command::Hello`] answers.
+    pub fn hello(&self) -> Hello {
+        Hello {
+            protocol: PROTOCOL_VERSION,
+            firmware: VERSION,
+            // Cannot fail: board names are short.
+            board: String::try_from(self.identity.board).unwrap_or_default(),
+            serial: self.identity.serial.clone(),
+            channels: CHANNELS as u8,
+            tick_hz: TICK_HZ,
+            can_clock_hz: CAN_CLOCK_HZ,
+            queue_bytes: QUEUE_BYTES as u32,
+            tx_queue: TX_QUEUE as u16,
+            periodic_slots: PERIODIC_SLOTS as u8,
+            trigger_slots: TRIGGER_SLOTS as u8,
+            filter_banks: BANKS as u8,
+            capabilities: capability::TRANSMIT
+                | capability::TIMED_TRANSMIT
+                | capability::SLCAN
+                | capability::DEFAULTS
+                | capability::BOOTLOADER,
+        }
+    }
+
+    /// Does a command, or begins it.
+    pub fn execute<'q, const N: usize>(
+        &mut self,
+        command: Command,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Step, Refusal> {
+        let reply = match command {
+            Command::Hello { protocol } if protocol != PROTOCOL_VERSION => {
+                return Err(Refusal::Protocol { device: PROTOCOL_VERSION });
+            }
+            Command::Hello { .. } => return Ok(self.begin(Work::Silence, board)),
+            Command::Open { channel, config } => return self.open(channel, config, board),
+            Command::Close { channel } => return Ok(self.close(channel, board)),
+            Command::Status => Reply::Status(self.status(board)),
+            Command::Time => Reply::Time(board.with_capture(|capture, _, clock| capture.now(clock))),
+            Command::SetFilters { channel, filters } => self.set_filters(channel, filters, board)?,
+            Command::Send { channel, frames } => send(channel, &frames, board)?,
+            Command::Abort { channel } => {
+                board.with_capture(|capture, traffic, clock| {
+                    capture.abort(channel, &mut traffic[channel.index()], clock);
+                });
+                Reply::Done
+            }
+            Command::SetPeriodic { channel, slot, entry } => set_periodic(channel, slot, entry, board)?,
+            Command::SetTrigger { channel, slot, entry } => set_trigger(channel, slot, entry, board)?,
+            Command::Registers { channel } => {
+                Reply::Registers(board.with_capture(|capture, traffic, _| {
+                    capture.registers(channel, &traffic[channel.index()])
+                }))
+            }
+            Command::Recover { channel } => return self.recover(channel, board),
+            Command::Identify { seconds } => {
+                board.chip().identify(seconds);
+                Reply::Done
+            }
+            Command::Reset => return Ok(self.begin(Work::Restart, board)),
+            Command::Bootloader => return Ok(self.begin(Work::Bootloader, board)),
+            Command::SaveDefaults => self.save(board)?,
+            Command::ClearDefaults => {
+                if !board.chip().save(&[]) {
+                    return Err(Refusal::Hardware);
+                }
+                Reply::Done
+            }
+        };
+        Ok(Step::Done(reply))
+    }
+
+    /// Begins work that the session looks after.
+    pub fn begin<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) -> Step {
+        self.begun = board.now();
+        match work {
+            Work::Silence => Channel::ALL.iter().for_each(|&channel| board.control(channel).stop()),
+            Work::Close(channel) | Work::Recover(channel) => board.control(channel).stop(),
+            Work::Open(..) | Work::Restart | Work::Bootloader => {}
+        }
+        Step::Begun(work)
+    }
+
+    /// Looks after work: its result when it is done, `None` while it is under way.
+    pub fn progress<'q, const N: usize>(
+        &mut self,
+        work: Work,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<Result<Reply, Refusal>> {
+        let waited = board.now().wrapping_sub(self.begun);
+        match work {
+            Work::Silence => {
+                for channel in Channel::ALL {
+                    if !stopped(channel, waited, board) {
+                        return None;
+                    }
+                }
+                self.forget(board);
+                Some(Ok(Reply::Hello(self.hello())))
+            }
+            Work::Open(channel, config) => {
+                if !stopped(channel, waited, board) {
+                    return None;
+                }
+                board.with_capture(|capture, _, clock| capture.open(channel, config, clock));
+                board.control(channel).start(&config);
+                self.settings[channel.index()].config = Some(config);
+                Some(Ok(Reply::Opened(config)))
+            }
+            Work::Close(channel) => {
+                if !stopped(channel, waited, board) {
+                    return None;
+                }
+                board
+                    .with_capture(|capture, traffic, clock| {
+                        capture.finish_close(channel, &mut traffic[channel.index()], clock)
+                    })
+                    .then_some(Ok(Reply::Done))
+            }
+            Work::Recover(channel) => {
+                if !stopped(channel, waited, board) {
+                    return None;
+                }
+                board.control(channel).resume();
+                Some(Ok(Reply::Done))
+            }
+            Work::Restart | Work::Bootloader => {
+                if waited < LEAVE_AFTER_TICKS {
+                    return None;
+                }
+                if matches!(work, Work::Bootloader) {
+                    board.chip().bootloader();
+                }
+                board.chip().reset();
+                // Only where there is no chip to restart.
+                Some(Ok(Reply::Done))
+            }
+        }
+    }
+
+    /// Both channels have left the bus: nothing of the last session remains.
+    fn forget<'q, const N: usize>(&mut self, board: &mut impl Board<'q, N>) {
+        for channel in Channel::ALL {
+            board.with_capture(|capture, traffic, _| {
+                capture.abandon(channel, &mut traffic[channel.index()]);
+            });
+        }
+        for settings in &mut self.settings {
+            settings.filters.clear();
+            settings.config = None;
+        }
+        self.bad_requests = 0;
+        let open = Layout::open();
+        if self.layout != open {
+            board.filters().write(&open);
+            self.layout = open;
+        }
+    }
+
+    /// A channel's configuration in this session, or the one that was saved.
+    pub fn config_or_saved<'q, const N: usize>(
+        &self,
+        channel: Channel,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<ChannelConfig> {
+        self.settings[channel.index()].config.or_else(|| load(board)?[channel.index()].config)
+    }
+
+    fn open<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        config: Option<ChannelConfig>,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Step, Refusal> {
+        if is_open(channel, board) {
+            return Err(Refusal::ChannelOpen);
+        }
+        let config = if let Some(config) = config {
+            config
+        } else {
+            let mut saved = load(board).ok_or(Refusal::NothingSaved)?;
+            let saved = core::mem::take(&mut saved[channel.index()]);
+            let config = saved.config.ok_or(Refusal::NothingSaved)?;
+            self.set_filters(channel, saved.filters, board)?;
+            config
+        };
+        if !config.timing.is_valid() {
+            return Err(Refusal::BadTiming);
+        }
+        Ok(self.begin(Work::Open(channel, config), board))
+    }
+
+    fn close<'q, const N: usize>(&mut self, channel: Channel, board: &mut impl Board<'q, N>) -> Step {
+        if !is_open(channel, board) {
+            return Step::Done(Reply::Done);
+        }
+        board.with_capture(|capture, traffic, clock| {
+            capture.begin_close(channel, &mut traffic[channel.index()], clock);
+        });
+        self.begin(Work::Close(channel), board)
+    }
+
+    fn recover<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Step, Refusal> {
+        let status = board.with_capture(|capture, _, _| capture.status(channel));
+        if status.open.is_none() {
+            return Err(Refusal::ChannelClosed);
+        }
+        if status.state != cantap_wire::record::ErrorState::BusOff {
+            return Err(Refusal::NotBusOff);
+        }
+        Ok(self.begin(Work::Recover(channel), board))
+    }
+
+    /// Replaces a closed channel's filters.
+    fn set_filters<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        filters: Vec<Filter, MAX_FILTERS>,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Reply, Refusal> {
+        if is_open(channel, board) {
+            return Err(Refusal::ChannelOpen);
+        }
+        let layout = self.layout.with(channel, &filters)?;
+        let other_open = Channel::ALL.iter().any(|&other| other != channel && is_open(other, board));
+        if other_open && self.layout.disturbs(&layout) {
+            return Err(Refusal::WouldDisturb);
+        }
+        board.filters().write(&layout);
+        self.layout = layout;
+        self.settings[channel.index()].filters = filters;
+        let used = Channel::ALL.map(|channel| self.layout.used(channel));
+        let banks_used = used[channel.index()];
+        let others: usize = used.iter().sum::<usize>() - banks_used;
+        Ok(Reply::Filters { banks_used: banks_used as u8, banks_total: (BANKS - others) as u8 })
+    }
+
+    fn status<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Status {
+        let (ticks, fill) = board.with_capture(|capture, _, clock| (capture.now(clock), capture.fill()));
+        // One channel a time, to hold the interrupts up for less.
+        let channels =
+            Channel::ALL.map(|channel| board.with_capture(|capture, _, _| capture.status(channel)));
+        let chip = board.chip();
+        Status {
+            ticks,
+            queue_bytes: fill.0,
+            queue_high_water_bytes: fill.1,
+            bad_requests: self.bad_requests,
+            temperature_decicelsius: chip.temperature_decicelsius(),
+            supply_millivolts: chip.supply_millivolts(),
+            channels,
+        }
+    }
+
+    /// Writing flash stops the processor for up to two seconds, so no channel may be open.
+    fn save<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
+        if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
+            return Err(Refusal::ChannelOpen);
+        }
+        if self.settings.iter().all(|settings| settings.config.is_none()) {
+            return Err(Refusal::NothingSaved);
+        }
+        let mut bytes = [0; MAX_SAVED];
+        let written = postcard::to_slice(&self.settings, &mut bytes).map_err(|_| Refusal::Hardware)?;
+        if board.chip().save(written) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }
+    }
+}
+
+/// This firmware's version.
+const VERSION: [u16; 3] = [
+    parse(env!("CARGO_PKG_VERSION_MAJOR")),
+    parse(env!("CARGO_PKG_VERSION_MINOR")),
+    parse(env!("CARGO_PKG_VERSION_PATCH")),
+];
+
+const fn parse(text: &str) -> u16 {
+    let bytes = text.as_bytes();
+    let mut value = 0;
+    let mut index = 0;
+    while index < bytes.len() {
+        value = value * 10 + (bytes[index] - b'0') as u16;
+        index += 1;
+    }
+    value
+}
+
+fn load<'q, const N: usize>(board: &mut impl Board<'q, N>) -> Option<[ChannelSettings; CHANNELS]> {
+    let mut bytes = [0; MAX_SAVED];
+    let len = board.chip().load(&mut bytes);
+    postcard::from_bytes(bytes.get(..len)?).ok()
+}
+
+fn is_open<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> bool {
+    board.with_capture(|capture, _, _| capture.config(channel).is_some())
+}
+
+/// Whether a channel has left the bus; after too long it is made to.
+fn stopped<'q, const N: usize>(channel: Channel, waited: u32, board: &mut impl Board<'q, N>) -> bool {
+    let control = board.control(channel);
+    if !control.is_stopped() && waited > STOP_WITHIN_TICKS {
+        control.halt();
+    }
+    control.is_stopped()
+}
+
+/// Checks that a channel can send this frame.
+fn can_send<'q, const N: usize>(
+    channel: Channel,
+    frames: impl Iterator<Item = Frame>,
+    board: &mut impl Board<'q, N>,
+) -> Result<(), Refusal> {
+    let config = board.with_capture(|capture, _, _| capture.config(channel).copied());
+    let config = config.ok_or(Refusal::ChannelClosed)?;
+    if !config.mode.transmits() {
+        return Err(Refusal::ListenOnly);
+    }
+    for frame in frames {
+        // The controller sends a DLC above 8 as it is, and receivers take eight bytes.
+        if frame.dlc() > 15 {
+            return Err(Refusal::BadDlc);
+        }
+    }
+    Ok(())
+}
+
+/// Queues frames, all or none.
+pub fn send<'q, const N: usize>(
+    channel: Channel,
+    frames: &Vec<TxFrame, MAX_SEND>,
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    can_send(channel, frames.iter().map(|frame| frame.frame), board)?;
+    if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
+        return Err(Refusal::BadTag);
+    }
+    let now = board.with_capture(|capture, _, clock| capture.now(clock));
+    if frames.iter().any(|frame| frame.at_ticks.is_some_and(|at| at > now + MAX_AHEAD_TICKS)) {
+        return Err(Refusal::TooFarAhead);
+    }
+    let free = board.with_capture(|capture, _, _| capture.transmitter(channel).free());
+    if free < frames.len() {
+        return Err(Refusal::QueueFull { free: free as u16 });
+    }
+    for frame in frames {
+        board.with_capture(|capture, _, _| capture.transmitter(channel).enqueue(frame));
+    }
+    let free = board.with_capture(|capture, traffic, clock| {
+        capture.kick(channel, &mut traffic[channel.index()], clock);
+        capture.transmitter(channel).free()
+    });
+    Ok(Reply::Queued { free: free as u16 })
+}
+
+fn set_periodic<'q, const N: usize>(
+    channel: Channel,
+    slot: u8,
+    entry: Option<Periodic>,
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    if slot as usize >= PERIODIC_SLOTS {
+        return Err(Refusal::BadSlot);
+    }
+    if let Some(entry) = &entry {
+        can_send(channel, core::iter::once(entry.frame), board)?;
+        if !transmit::is_valid(entry) {
+            return Err(Refusal::BadEntry);
+        }
+    }
+    board.with_capture(|capture, traffic, clock| {
+        let now = capture.now(clock);
+        capture.transmitter(channel).set_periodic(slot as usize, entry, now);
+        capture.kick(channel, &mut traffic[channel.index()], clock);
+    });
+    Ok(Reply::Done)
+}
+
+fn set_trigger<'q, const N: usize>(
+    channel: Channel,
+    slot: u8,
+    entry: Option<Trigger>,
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    if slot as usize >= TRIGGER_SLOTS {
+        return Err(Refusal::BadSlot);
+    }
+    if let Some(entry) = &entry {
+        can_send(channel, core::iter::once(entry.reply), board)?;
+    }
+    board.with_capture(|capture, _, _| capture.transmitter(channel).set_trigger(slot as usize, entry));
+    Ok(Reply::Done)
+}

@@ -1,0 +1,64 @@
+//! Hands a message to the port, packet by packet.
+
+use cantap_wire::framing::MAX_ENCODED;
+
+use crate::ports::{PACKET, Port};
+
+/// The message on its way out.
+pub struct Outbox {
+    message: [u8; MAX_ENCODED],
+    len: usize,
+    sent: usize,
+    /// The last packet was full: without a shorter one the host would wait for more.
+    must_end: bool,
+}
+
+impl Outbox {
+    /// Nothing to send.
+    pub const fn new() -> Self {
+        Self { message: [0; MAX_ENCODED], len: 0, sent: 0, must_end: false }
+    }
+
+    /// Forgets everything.
+    pub fn clear(&mut self) {
+        self.len = 0;
+        self.sent = 0;
+        self.must_end = false;
+    }
+
+    /// Whether the next message can be filled in.
+    pub const fn is_empty(&self) -> bool {
+        self.sent == self.len
+    }
+
+    /// Lets `write` fill in the next message; it returns its length.
+    pub fn fill(&mut self, write: impl FnOnce(&mut [u8]) -> usize) {
+        self.len = write(&mut self.message).min(MAX_ENCODED);
+        self.sent = 0;
+    }
+
+    /// Hands packets to the port until it takes no more or the message ends.
+    pub fn pump(&mut self, port: &mut impl Port) {
+        while self.sent < self.len {
+            let end = self.len.min(self.sent + PACKET);
+            if !port.write(&self.message[self.sent..end]) {
+                return;
+            }
+            self.must_end = end - self.sent == PACKET;
+            self.sent = end;
+        }
+    }
+
+    /// Nothing follows for now: ends the transfer with an empty packet if the last one was full (USB 2.0, 5.8.3).
+    pub fn end(&mut self, port: &mut impl Port) {
+        if self.must_end && self.is_empty() && port.write(&[]) {
+            self.must_end = false;
+        }
+    }
+}
+
+impl Default for Outbox {
+    fn default() -> Self {
+        Self::new()
+    }
+}

@@ -1,0 +1,153 @@
+//! What the logic needs from hardware, as small traits: the board implements them over registers, tests
+//! and the virtual device with fakes.
+//!
+//! A CAN controller has two sides. [`Traffic`] is touched by the highest-priority interrupts only,
+//! [`Control`] by commands only; the registers behind them are disjoint, so neither waits for the other.
+
+use cantap_wire::message::{ChannelConfig, RegisterSet};
+use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{CHANNELS, Channel, Frame};
+
+use crate::capture::Capture;
+use crate::filters::Layout;
+
+/// The free-running stamp timer at [`crate::TICK_HZ`], with one alarm.
+pub trait Clock {
+    /// The timer now; wraps at 32 bits.
+    fn now(&self) -> u32;
+    /// Calls the alarm interrupt at this time; at once if it has passed (by less than half the
+    /// timer's range); never if `None`.
+    fn set_alarm(&self, at: Option<u32>);
+}
+
+/// How a transmission ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Outcome {
+    /// On the bus, acknowledged.
+    Sent,
+    /// Given up after losing arbitration (one-shot mode).
+    ArbitrationLost,
+    /// Given up after an error (one-shot mode).
+    Error,
+    /// Aborted on request.
+    Aborted,
+}
+
+/// The controller's error status.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ErrorStatus {
+    /// The error since the last call, if there was one.
+    pub kind: Option<BusErrorKind>,
+    /// Fault confinement.
+    pub state: ErrorState,
+    /// Transmit error counter.
+    pub tec: u8,
+    /// Receive error counter.
+    pub rec: u8,
+}
+
+/// A controller's traffic side. No method waits.
+pub trait Traffic {
+    /// Frames waiting in the receive FIFO: 0 to 3.
+    fn pending(&self) -> u8;
+    /// Takes the oldest frame out of the receive FIFO.
+    fn receive(&mut self) -> Option<Frame>;
+    /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the
+    /// oldest and drops the newest.
+    fn take_overrun(&mut self) -> bool;
+    /// Requests transmission; frames leave in the order of these calls. Returns the mailbox, a number
+    /// below [`crate::transmit::MAILBOXES`], or
+    /// `None` if all are taken.
+    fn transmit(&mut self, frame: &Frame) -> Option<u8>;
+    /// Takes one finished transmission: its mailbox and how it ended.
+    fn take_finished(&mut self) -> Option<(u8, Outcome)>;
+    /// Asks for every mailbox to be given up. Those that can still be are reported as
+    /// [`Outcome::Aborted`], a frame already on the bus may end as sent.
+    fn abort(&mut self);
+    /// Reads and clears what the error interrupt reports.
+    fn take_errors(&mut self) -> ErrorStatus;
+    /// The controller's registers, for diagnosis.
+    fn registers(&self) -> RegisterSet;
+}
+
+/// A controller's control side. No method waits.
+pub trait Control {
+    /// Asks the controller to leave the bus. It does so when the frame on the bus, if any, has ended.
+    fn stop(&mut self);
+    /// Makes it leave the bus at once, even in the middle of a frame: for a bus that is stuck.
+    fn halt(&mut self);
+    /// Whether it has left the bus.
+    fn is_stopped(&self) -> bool;
+    /// Applies a configuration that is valid, and joins the bus after 11 recessive bits. Only when
+    /// stopped.
+    fn start(&mut self, config: &ChannelConfig);
+    /// Joins the bus again as configured before. Only when stopped.
+    fn resume(&mut self);
+}
+
+/// The acceptance filters of all controllers.
+pub trait FilterBanks {
+    /// Writes all banks. Reception is interrupted, so no channel may be open unless the layout's shape
+    /// (split, modes, scales) is what it was and only closed channels' banks differ.
+    fn write(&mut self, layout: &Layout);
+}
+
+/// The chip itself.
+pub trait Chip {
+    /// Temperature in 0.1 °C, if it can be measured.
+    fn temperature_decicelsius(&mut self) -> Option<i16>;
+    /// Supply voltage in mV, if it can be measured.
+    fn supply_millivolts(&mut self) -> Option<u16>;
+    /// Shows a pattern on the LEDs for so long.
+    fn identify(&mut self, seconds: u8);
+    /// Restarts the firmware; on the board it does not return.
+    fn reset(&mut self);
+    /// Enters the ROM bootloader; on the board it does not return. Returns whether there is one.
+    fn bootloader(&mut self) -> bool;
+    /// Stores bytes (at most [`crate::command::MAX_SAVED`]) over a power cycle; empty erases. Returns whether it worked.
+    fn save(&mut self, bytes: &[u8]) -> bool;
+    /// Reads what was stored into `out` and returns its length.
+    fn load(&mut self, out: &mut [u8]) -> usize;
+}
+
+/// All of it together, as commands see it.
+pub trait Board<'q, const N: usize> {
+    /// Controllers' traffic side.
+    type Traffic: Traffic;
+    /// Controllers' control side.
+    type Control: Control;
+    /// Stamp timer.
+    type Clock: Clock;
+    /// Acceptance filters.
+    type Filters: FilterBanks;
+    /// The chip.
+    type Chip: Chip;
+
+    /// Lets `act` touch what the highest-priority interrupts share. It holds them up meanwhile, so `act`
+    /// must be short: it adds to the stamps' latency.
+    fn with_capture<R>(
+        &mut self,
+        act: impl FnOnce(&mut Capture<'q, N>, &mut [Self::Traffic; CHANNELS], &Self::Clock) -> R,
+    ) -> R;
+    /// The stamp timer now.
+    fn now(&self) -> u32;
+    /// A channel's control side.
+    fn control(&mut self, channel: Channel) -> &mut Self::Control;
+    /// The acceptance filters.
+    fn filters(&mut self) -> &mut Self::Filters;
+    /// The chip.
+    fn chip(&mut self) -> &mut Self::Chip;
+}
+
+/// The USB port's data pipes.
+pub trait Port {
+    /// Whether a host has the port open.
+    fn is_open(&self) -> bool;
+    /// Hands over one packet of at most [`PACKET`] bytes; false if the last one is still waiting.
+    fn write(&mut self, packet: &[u8]) -> bool;
+    /// Takes one packet and returns its length.
+    fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize>;
+}
+
+/// Largest packet of a full-speed bulk endpoint, in bytes (USB 2.0, 5.8.3).
+pub const PACKET: usize = 64;

@@ -1,0 +1,132 @@
+//! The record queue between the capture interrupts and USB: a lock-free byte ring that knows how
+//! full it is. Records are whole and contiguous in it.
+
+use core::sync::atomic::{AtomicU32, Ordering};
+
+use bbqueue::nicknames::Churrasco;
+use bbqueue::prod_cons::stream::{StreamConsumer, StreamProducer};
+use cantap_wire::record::MAX_RECORD;
+
+use crate::QUEUE_BYTES;
+
+/// Bytes that frames leave free, so that what explains their absence (loss, state, stop) still fits.
+const RESERVE: u32 = 512;
+/// After the queue was full, frames are taken again when so much is free: one long gap says the same as
+/// hundreds of short ones, in fewer bytes.
+const RESUME_FREE: u32 = 4096;
+
+/// The ring.
+pub struct RecordQueue<const N: usize = QUEUE_BYTES> {
+    ring: Churrasco<N>,
+    /// Bytes ever released by the consumer; wraps.
+    released: AtomicU32,
+}
+
+impl<const N: usize> RecordQueue<N> {
+    /// An empty queue.
+    pub const fn new() -> Self {
+        const { assert!(N > 2 * RESUME_FREE as usize) };
+        Self { ring: Churrasco::new(), released: AtomicU32::new(0) }
+    }
+
+    /// Its two ends. There must be one of each only.
+    pub const fn split(&self) -> (Producer<'_, N>, Consumer<'_, N>) {
+        let producer = Producer {
+            queue: self,
+            ring: self.ring.stream_producer(),
+            written: 0,
+            high_water: 0,
+            full: false,
+        };
+        (producer, Consumer { queue: self, ring: self.ring.stream_consumer() })
+    }
+}
+
+impl<const N: usize> Default for RecordQueue<N> {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// What a record is to the queue.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Kind {
+    /// A received frame: is refused when the queue runs full.
+    Frame,
+    /// Anything else: may use the reserve.
+    Event,
+}
+
+/// The interrupts' end.
+pub struct Producer<'q, const N: usize> {
+    queue: &'q RecordQueue<N>,
+    ring: StreamProducer<&'q Churrasco<N>>,
+    written: u32,
+    high_water: u32,
+    full: bool,
+}
+
+impl<const N: usize> Producer<'_, N> {
+    /// Bytes in the queue.
+    pub fn fill(&self) -> u32 {
+        self.written.wrapping_sub(self.queue.released.load(Ordering::Acquire))
+    }
+
+    /// Most bytes ever in the queue since [`Self::reset_high_water`].
+    pub const fn high_water(&self) -> u32 {
+        self.high_water
+    }
+
+    /// Starts the high-water mark over.
+    pub fn reset_high_water(&mut self) {
+        self.high_water = self.fill();
+    }
+
+    /// Whether a frame would be taken now. Once full, not before much is free.
+    #[inline]
+    pub fn takes_frames(&mut self) -> bool {
+        let free = (N as u32).saturating_sub(self.fill());
+        self.full = free < if self.full { RESUME_FREE } else { RESERVE };
+        !self.full
+    }
+
+    /// Lets `encode` write one record in place. Returns false, without a call, if there is no room.
+    #[inline]
+    pub fn push(&mut self, kind: Kind, encode: impl FnOnce(&mut [u8; MAX_RECORD]) -> usize) -> bool {
+        if kind == Kind::Frame && !self.takes_frames() {
+            return false;
+        }
+        let Ok(mut grant) = self.ring.grant_exact(MAX_RECORD) else {
+            self.full |= kind == Kind::Frame;
+            return false;
+        };
+        let Some(room) = grant.first_chunk_mut::<MAX_RECORD>() else { return false };
+        let len = encode(room);
+        grant.commit(len);
+        self.written = self.written.wrapping_add(len as u32);
+        self.high_water = self.high_water.max(self.fill());
+        true
+    }
+}
+
+/// USB's end.
+pub struct Consumer<'q, const N: usize> {
+    queue: &'q RecordQueue<N>,
+    ring: StreamConsumer<&'q Churrasco<N>>,
+}
+
+impl<const N: usize> Consumer<'_, N> {
+    /// Shows `take` the contiguous bytes that are there, whole records all of them; it returns how many it used.
+    pub fn read(&mut self, take: impl FnOnce(&[u8]) -> usize) -> usize {
+        let Ok(grant) = self.ring.read() else { return 0 };
+        let used = take(&grant).min(grant.len());
+        grant.release(used);
+        self.queue.released.fetch_add(used as u32, Ordering::Release);
+        used
+    }
+
+    /// Drops everything. Nothing may be pushed meanwhile.
+    pub fn clear(&mut self) {
+        while self.read(<[u8]>::len) > 0 {}
+    }
+}

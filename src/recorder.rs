@@ -1,0 +1,132 @@
+//! Writes records into the queue: each with its time since the last one, and a loss record in place
+//! of what did not fit.
+
+use cantap_wire::record::{LossStage, encode_event, encode_received};
+use cantap_wire::{CHANNELS, Channel, Event, Received};
+
+use crate::QUEUE_BYTES;
+use crate::queue::{Kind, Producer};
+use crate::time::Timebase;
+
+/// A time mark is written when nothing else was for so many ticks, so that a time difference always
+/// fits an `i32`: half its range.
+const MARK_AFTER_TICKS: u64 = 1 << 30;
+
+/// The only writer of the queue. Lives in the highest-priority interrupts.
+pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
+    producer: Producer<'q, N>,
+    time: Timebase,
+    /// Time of the last record, which the next difference counts from.
+    last_ticks: u64,
+    /// Frames that did not fit and that no loss record stands for yet.
+    unreported: [u32; CHANNELS],
+    /// All frames that did not fit.
+    lost: [u32; CHANNELS],
+}
+
+impl<'q, const N: usize> Recorder<'q, N> {
+    /// A recorder at time zero.
+    pub const fn new(producer: Producer<'q, N>) -> Self {
+        Self {
+            producer,
+            time: Timebase::new(),
+            last_ticks: 0,
+            unreported: [0; CHANNELS],
+            lost: [0; CHANNELS],
+        }
+    }
+
+    /// The 64-bit time of a stamp.
+    #[inline]
+    pub fn time(&mut self, stamp: u32) -> u64 {
+        self.time.extend(stamp)
+    }
+
+    /// Starts a session at `now`: the first record's difference counts from there. The queue must be empty.
+    pub fn restart(&mut self, now: u64) {
+        self.last_ticks = now;
+        self.unreported = [0; CHANNELS];
+        self.lost = [0; CHANNELS];
+        self.producer.reset_high_water();
+    }
+
+    /// Writes a received frame, or counts it as lost.
+    #[inline]
+    pub fn frame(&mut self, received: &Received, at: u64) {
+        if self.unreported != [0; CHANNELS] {
+            self.report_losses(at);
+        }
+        let index = received.channel.index();
+        let difference = self.difference(at);
+        if self.producer.push(Kind::Frame, |room| encode_received(received, difference, room)) {
+            if received.stamp != cantap_wire::Stamp::Omitted {
+                self.last_ticks = at;
+            }
+        } else {
+            self.unreported[index] = self.unreported[index].wrapping_add(1);
+            self.lost[index] = self.lost[index].wrapping_add(1);
+        }
+    }
+
+    /// Writes an event and returns whether there was room for it.
+    pub fn event(&mut self, event: &Event, at: u64) -> bool {
+        if self.unreported != [0; CHANNELS] {
+            self.report_losses(at);
+        }
+        self.write(event, at)
+    }
+
+    fn write(&mut self, event: &Event, at: u64) -> bool {
+        let difference = self.difference(at);
+        let written = self.producer.push(Kind::Event, |room| encode_event(event, difference, room));
+        if written {
+            self.last_ticks = at;
+        }
+        written
+    }
+
+    /// Ticks from the last record to `at`. They fit: see [`MARK_AFTER_TICKS`].
+    #[inline]
+    fn difference(&self, at: u64) -> i32 {
+        at.wrapping_sub(self.last_ticks) as i32
+    }
+
+    /// Writes a loss record for each channel that lost frames, once the queue takes frames again. It then
+    /// stands exactly where they are missing.
+    fn report_losses(&mut self, at: u64) {
+        if !self.producer.takes_frames() {
+            return;
+        }
+        self.flush_losses(at);
+    }
+
+    /// Writes a loss record for each channel that lost frames, now.
+    pub fn flush_losses(&mut self, at: u64) {
+        for channel in Channel::ALL {
+            let count = self.unreported[channel.index()];
+            let event = Event::Lost { channel, stage: LossStage::Queue, count, at_least: false };
+            if count > 0 && self.write(&event, at) {
+                self.unreported[channel.index()] = 0;
+            }
+        }
+    }
+
+    /// Once a millisecond while a session is on: reports losses that no later frame has reported, and
+    /// keeps time differences small.
+    pub fn tick(&mut self, now: u64) {
+        self.report_losses(now);
+        if now.wrapping_sub(self.last_ticks) > MARK_AFTER_TICKS && now > self.last_ticks {
+            self.write(&Event::TimeMark, now);
+        }
+    }
+
+    /// Frames of a channel that the queue lost since [`Self::restart`].
+    pub const fn lost(&self, channel: Channel) -> u32 {
+        self.lost[channel.index()]
+    }
+
+    /// Bytes in the queue, and the most there ever were.
+    pub fn fill(&self) -> (u32, u32) {
+        (self.producer.fill(), self.producer.high_water())
+    }
+}

@@ -1,0 +1,86 @@
+//! Packs queued records into batches: walks whole records and keeps the running time, so that every
+//! batch carries an absolute time of its own.
+
+use cantap_wire::batch::BatchWriter;
+use cantap_wire::record::{self, Record};
+
+use crate::TICKS_PER_MS;
+use crate::queue::Consumer;
+
+/// A batch is sent when it is full, or so long after its first record came.
+const FLUSH_AFTER_TICKS: u32 = TICKS_PER_MS;
+
+/// Turns queued records into batches.
+pub struct Sender {
+    batch: BatchWriter,
+    /// Device time of the last record taken from the queue.
+    running_ticks: u64,
+    /// When the batch got its first record.
+    started: u32,
+    /// The next record does not fit any more.
+    full: bool,
+}
+
+impl Sender {
+    /// Nothing to send.
+    pub const fn new() -> Self {
+        Self { batch: BatchWriter::new(), running_ticks: 0, started: 0, full: false }
+    }
+
+    /// Starts a session: sequence number 0, and the first record's difference counts from `now`.
+    pub fn restart(&mut self, now: u64) {
+        self.batch.restart();
+        self.running_ticks = now;
+        self.full = false;
+    }
+
+    /// Takes records from the queue; if a batch is due, writes it to `out`, encoded, and returns its length.
+    pub fn next_batch<const N: usize>(
+        &mut self,
+        queue: &mut Consumer<'_, N>,
+        now: u32,
+        out: &mut [u8],
+    ) -> usize {
+        // The ring may be read in two pieces, before and after its wrap.
+        while !self.full && queue.read(|bytes| self.take(bytes, now)) > 0 {}
+        let old = now.wrapping_sub(self.started) >= FLUSH_AFTER_TICKS;
+        if !(self.full || old && !self.batch.is_empty()) {
+            return 0;
+        }
+        self.full = false;
+        self.batch.finish(out)
+    }
+
+    /// Appends whole records until the batch is full and returns their length.
+    fn take(&mut self, bytes: &[u8], now: u32) -> usize {
+        let mut rest = bytes;
+        while !rest.is_empty() {
+            let Ok((record, difference, after)) = record::decode(rest) else {
+                // Cannot happen, since the recorder wrote it; if it did, the rest could not be read either.
+                rest = &[];
+                break;
+            };
+            let frame_of = match &record {
+                Record::Received(received) => Some(received.channel),
+                Record::Event(_) => None,
+            };
+            if self.batch.is_empty() {
+                self.started = now;
+            }
+            let len = rest.len() - after.len();
+            if !self.batch.push(&rest[..len], self.running_ticks, frame_of) {
+                self.full = true;
+                break;
+            }
+            self.running_ticks = self.running_ticks.wrapping_add_signed(i64::from(difference));
+            rest = after;
+        }
+        bytes.len() - rest.len()
+    }
+}
+
+impl Default for Sender {
+    fn default() -> Self {
+        Self::new()
+    }
+}

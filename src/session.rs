@@ -1,0 +1,275 @@
+//! One host at a time: what it sends is read here, and everything that it gets leaves here.
+//!
+//! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
+//! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
+
+use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, seal, unseal};
+use cantap_wire::message::DeviceMessage;
+use cantap_wire::{Command, Refusal, Reply, Request, Response};
+
+use crate::QUEUE_BYTES;
+use crate::command::{Commands, Identity, Step, Work};
+use crate::inbox::Inbox;
+use crate::outbox::Outbox;
+use crate::ports::{Board, PACKET, Port};
+use crate::queue::Consumer;
+use crate::sender::Sender;
+use crate::slcan::{Answer, Slcan};
+
+/// Longest request on the wire, zero byte included.
+const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);
+/// Largest response before CRC and COBS: a status, a greeting and the registers are all below 256 bytes.
+const MAX_RESPONSE: usize = 512;
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Language {
+    /// The host has said nothing yet.
+    Unknown,
+    /// Before and after `Hello`.
+    Native {
+        greeted: bool,
+    },
+    Slcan,
+}
+
+/// Who waits for the work under way.
+#[derive(Clone, Copy, Debug)]
+enum Origin {
+    /// The request with this id.
+    Request(u16),
+    /// An slcan line.
+    Line,
+    /// Nobody.
+    Device,
+}
+
+/// Everything between the record queue and the port.
+pub struct Session<'q, const N: usize = QUEUE_BYTES> {
+    queue: Consumer<'q, N>,
+    sender: Sender,
+    slcan: Slcan,
+    commands: Commands,
+    inbox: Inbox,
+    outbox: Outbox,
+    language: Language,
+    work: Option<(Work, Origin)>,
+    response: Option<Response>,
+}
+
+impl<'q, const N: usize> Session<'q, N> {
+    /// No host yet.
+    pub const fn new(queue: Consumer<'q, N>, identity: Identity) -> Self {
+        Self {
+            queue,
+            sender: Sender::new(),
+            slcan: Slcan::new(),
+            commands: Commands::new(identity),
+            inbox: Inbox::new(),
+            outbox: Outbox::new(),
+            language: Language::Unknown,
+            work: None,
+            response: None,
+        }
+    }
+
+    /// Whether a host talks to the device.
+    pub fn is_active(&self) -> bool {
+        self.language != Language::Unknown
+    }
+
+    /// Reads, works and writes as far as it goes without waiting. To be called at every USB interrupt and
+    /// every millisecond.
+    pub fn poll(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
+        if !port.is_open() {
+            return self.hang_up(port, board);
+        }
+        self.read(port);
+        loop {
+            self.look_after_work(board);
+            self.outbox.pump(port);
+            let moved = self.outbox.is_empty() && self.fill_outbox(board);
+            let handled = self.handle_next(board);
+            if !moved && !handled {
+                break;
+            }
+        }
+        self.outbox.end(port);
+    }
+
+    /// The host is gone: the channels leave the bus, and nothing of it remains.
+    fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
+        let mut packet = [0; PACKET];
+        while port.read(&mut packet).is_some() {}
+        if self.is_active() {
+            self.language = Language::Unknown;
+            self.inbox.clear();
+            self.outbox.clear();
+            self.response = None;
+            self.begin(Work::Silence, Origin::Device, board);
+        }
+        self.look_after_work(board);
+    }
+
+    /// Takes every packet that is there: one left in the USB peripheral would hold up the control
+    /// pipe behind it. What finds no room is dropped and counted; a host that waits for responses
+    /// never gets there.
+    fn read(&mut self, port: &mut impl Port) {
+        let mut packet = [0; PACKET];
+        while let Some(len) = port.read(&mut packet) {
+            if !self.inbox.push(&packet[..len]) {
+                self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
+            }
+        }
+    }
+
+    fn begin(&mut self, work: Work, origin: Origin, board: &mut impl Board<'q, N>) {
+        self.commands.begin(work, board);
+        self.work = Some((work, origin));
+    }
+
+    fn look_after_work(&mut self, board: &mut impl Board<'q, N>) {
+        let Some((work, origin)) = self.work else { return };
+        let Some(result) = self.commands.progress(work, board) else { return };
+        self.work = None;
+        if matches!(work, Work::Silence) {
+            self.queue.clear();
+            let now = board.with_capture(|capture, _, clock| {
+                capture.restart(clock);
+                capture.now(clock)
+            });
+            self.sender.restart(now);
+            self.slcan.restart(now);
+        }
+        match origin {
+            Origin::Request(id) => {
+                if matches!(work, Work::Silence) {
+                    self.language = Language::Native { greeted: true };
+                    self.outbox.clear();
+                }
+                self.response = Some(Response { id, result });
+            }
+            Origin::Line => self.slcan.answer(if result.is_ok() { Answer::Ok } else { Answer::Refused }),
+            Origin::Device => {}
+        }
+    }
+
+    /// Handles one request or line, unless something is still under way or unanswered. Returns whether there was one.
+    fn handle_next(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        if self.work.is_some() || self.response.is_some() || self.slcan.is_answering() {
+            return false;
+        }
+        if self.language == Language::Unknown || self.inbox.first() == Some(0) {
+            return self.choose_language(board);
+        }
+        match self.language {
+            Language::Native { greeted } => self.handle_request(greeted, board),
+            Language::Slcan => self.handle_line(board),
+            Language::Unknown => false,
+        }
+    }
+
+    /// The first byte tells the language. A zero changes to the native one at any time.
+    fn choose_language(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        let Some(first) = self.inbox.first() else { return false };
+        match first {
+            0 => {
+                self.inbox.skip(1);
+                if !matches!(self.language, Language::Native { .. }) {
+                    self.language = Language::Native { greeted: false };
+                }
+            }
+            b'\r' | b'A'..=b'Z' | b'a'..=b'z' => {
+                self.language = Language::Slcan;
+                self.begin(Work::Silence, Origin::Device, board);
+            }
+            _ => self.inbox.skip(1),
+        }
+        true
+    }
+
+    fn handle_request(&mut self, greeted: bool, board: &mut impl Board<'q, N>) -> bool {
+        let mut message = [0; MAX_REQUEST_ENCODED];
+        let taken = self.inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| {
+            unseal(encoded, &mut message).map(|message| {
+                (
+                    postcard::take_from_bytes::<u16>(message).map(|(id, _)| id),
+                    postcard::from_bytes::<Request>(message),
+                )
+            })
+        });
+        let Some(message) = taken else { return false };
+        let (id, result) = match message {
+            Some(Ok((_, Ok(Request { id, command })))) => {
+                if !greeted && !matches!(command, Command::Hello { .. }) {
+                    (id, Err(Refusal::NoSession))
+                } else {
+                    (id, self.commands.execute(command, board))
+                }
+            }
+            // It was sent as it is, and is something that this device does not know.
+            Some(Ok((Ok(id), Err(_)))) => {
+                self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
+                (id, Err(Refusal::Malformed))
+            }
+            // Damaged: there is no telling whom to answer.
+            _ => {
+                self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
+                return true;
+            }
+        };
+        match result {
+            Ok(Step::Done(reply)) => self.response = Some(Response { id, result: Ok(reply) }),
+            Ok(Step::Begun(work)) => {
+                if matches!(work, Work::Restart | Work::Bootloader) {
+                    // It ends in a restart: the answer goes first.
+                    self.response = Some(Response { id, result: Ok(Reply::Done) });
+                    self.work = Some((work, Origin::Device));
+                } else {
+                    self.work = Some((work, Origin::Request(id)));
+                }
+            }
+            Err(refusal) => self.response = Some(Response { id, result: Err(refusal) }),
+        }
+        true
+    }
+
+    fn handle_line(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        let mut line = heapless::Vec::<u8, { Slcan::MAX_LINE }>::new();
+        let Some(taken) =
+            self.inbox.take_until(b'\r', Slcan::MAX_LINE, |bytes| line.extend_from_slice(bytes))
+        else {
+            return false;
+        };
+        if taken.is_none_or(|copied| copied.is_err()) {
+            self.slcan.answer(Answer::Refused);
+            return true;
+        }
+        if let Some(work) = self.slcan.line(&line, &mut self.commands, board) {
+            self.work = Some((work, Origin::Line));
+        }
+        true
+    }
+
+    /// Fills the empty outbox with what goes next: an answer, then what was captured. Returns whether there was something.
+    fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        let Self { queue, sender, slcan, outbox, response, .. } = self;
+        match self.language {
+            Language::Unknown => {}
+            Language::Native { .. } => match response.take() {
+                Some(response) => outbox.fill(|out| encode_response(response, out)),
+                None => outbox.fill(|out| sender.next_batch(queue, board.now(), out)),
+            },
+            Language::Slcan => outbox.fill(|out| slcan.next_lines(queue, out)),
+        }
+        !self.outbox.is_empty()
+    }
+}
+
+/// Writes a response, encoded, to `out` and returns its length.
+fn encode_response(response: Response, out: &mut [u8]) -> usize {
+    let mut message = [0; MAX_RESPONSE + CRC_LEN];
+    let written = postcard::to_slice(&DeviceMessage::Response(response), &mut message[..MAX_RESPONSE]);
+    // Cannot fail: every response is shorter (tested).
+    let len = written.map_or(0, |written| written.len());
+    seal(&mut message, len, out).unwrap_or(0)
+}

@@ -1,0 +1,464 @@
+//! A board of fakes: controllers, clock and port that a test moves by hand.
+#![allow(dead_code, reason = "each test file uses its part")]
+
+use std::cell::Cell;
+use std::collections::VecDeque;
+
+use cantap_firmware::capture::Capture;
+use cantap_firmware::command::Identity;
+use cantap_firmware::filters::Layout;
+use cantap_firmware::ports::{
+    Board, Chip, Clock, Control, ErrorStatus, FilterBanks, Outcome, PACKET, Port, Traffic,
+};
+use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::session::Session;
+use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
+use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
+use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{
+    BitTiming, CHANNELS, Channel, Command, Decoded, Decoder, Event, Frame, Id, PROTOCOL_VERSION, Record,
+    Refusal, Reply, Request, Response,
+};
+
+/// The record queue of the tests: small, so that it overflows soon.
+pub const SMALL_QUEUE: usize = 16 * 1024;
+
+#[derive(Default)]
+pub struct FakeClock {
+    pub now: Cell<u32>,
+    pub alarm: Cell<Option<u32>>,
+}
+
+impl Clock for FakeClock {
+    fn now(&self) -> u32 {
+        self.now.get()
+    }
+
+    fn set_alarm(&self, at: Option<u32>) {
+        self.alarm.set(at);
+    }
+}
+
+/// A controller's traffic side: a FIFO three deep that keeps the oldest, three mailboxes.
+#[derive(Default)]
+pub struct FakeTraffic {
+    pub fifo: VecDeque<Frame>,
+    pub overrun: bool,
+    pub mailboxes: [Option<Frame>; 3],
+    /// The order in which mailboxes were filled.
+    pub order: VecDeque<u8>,
+    pub finished: VecDeque<(u8, Outcome)>,
+    pub aborts: usize,
+    pub error: Option<BusErrorKind>,
+    pub state: Option<ErrorState>,
+    pub counters: (u8, u8),
+}
+
+impl FakeTraffic {
+    /// A frame comes off the bus.
+    pub fn arrive(&mut self, frame: Frame) {
+        if self.fifo.len() < 3 { self.fifo.push_back(frame) } else { self.overrun = true }
+    }
+
+    /// The bus takes the oldest mailbox's frame.
+    pub fn send_one(&mut self) -> Option<Frame> {
+        let mailbox = self.order.pop_front()?;
+        let frame = self.mailboxes[mailbox as usize].take()?;
+        self.finished.push_back((mailbox, Outcome::Sent));
+        Some(frame)
+    }
+}
+
+impl Traffic for FakeTraffic {
+    fn pending(&self) -> u8 {
+        self.fifo.len() as u8
+    }
+
+    fn receive(&mut self) -> Option<Frame> {
+        self.fifo.pop_front()
+    }
+
+    fn take_overrun(&mut self) -> bool {
+        std::mem::take(&mut self.overrun)
+    }
+
+    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+        let free = self.mailboxes.iter().position(Option::is_none)?;
+        // A mailbox is free for the next frame only when its end was taken, as on the chip.
+        if self.finished.iter().any(|(mailbox, _)| *mailbox as usize == free) {
+            return None;
+        }
+        self.mailboxes[free] = Some(*frame);
+        self.order.push_back(free as u8);
+        Some(free as u8)
+    }
+
+    fn take_finished(&mut self) -> Option<(u8, Outcome)> {
+        self.finished.pop_front()
+    }
+
+    fn abort(&mut self) {
+        self.aborts += 1;
+        while let Some(mailbox) = self.order.pop_front() {
+            self.mailboxes[mailbox as usize] = None;
+            self.finished.push_back((mailbox, Outcome::Aborted));
+        }
+    }
+
+    fn take_errors(&mut self) -> ErrorStatus {
+        ErrorStatus {
+            kind: self.error.take(),
+            state: self.state.unwrap_or(ErrorState::Active),
+            tec: self.counters.0,
+            rec: self.counters.1,
+        }
+    }
+
+    fn registers(&self) -> RegisterSet {
+        RegisterSet {
+            esr: u32::from(self.counters.0) << 16 | u32::from(self.counters.1) << 24,
+            ..Default::default()
+        }
+    }
+}
+
+#[derive(Default)]
+pub struct FakeControl {
+    pub running: bool,
+    /// The bus is stuck: it does not leave by itself.
+    pub stuck: bool,
+    pub halts: usize,
+    pub started: Vec<ChannelConfig>,
+    pub resumed: usize,
+}
+
+impl Control for FakeControl {
+    fn stop(&mut self) {
+        self.running &= self.stuck;
+    }
+
+    fn halt(&mut self) {
+        self.running = false;
+        self.halts += 1;
+    }
+
+    fn is_stopped(&self) -> bool {
+        !self.running
+    }
+
+    fn start(&mut self, config: &ChannelConfig) {
+        assert!(!self.running, "a running controller must not be configured");
+        self.running = true;
+        self.started.push(*config);
+    }
+
+    fn resume(&mut self) {
+        self.running = true;
+        self.resumed += 1;
+    }
+}
+
+#[derive(Default)]
+pub struct FakeFilters {
+    pub written: Vec<Layout>,
+}
+
+impl FilterBanks for FakeFilters {
+    fn write(&mut self, layout: &Layout) {
+        self.written.push(layout.clone());
+    }
+}
+
+#[derive(Default)]
+pub struct FakeChip {
+    pub saved: Vec<u8>,
+    pub identified: Vec<u8>,
+    pub resets: usize,
+    pub bootloaders: usize,
+}
+
+impl Chip for FakeChip {
+    fn temperature_decicelsius(&mut self) -> Option<i16> {
+        Some(312)
+    }
+
+    fn supply_millivolts(&mut self) -> Option<u16> {
+        Some(3301)
+    }
+
+    fn identify(&mut self, seconds: u8) {
+        self.identified.push(seconds);
+    }
+
+    fn reset(&mut self) {
+        self.resets += 1;
+    }
+
+    fn bootloader(&mut self) -> bool {
+        self.bootloaders += 1;
+        true
+    }
+
+    fn save(&mut self, bytes: &[u8]) -> bool {
+        self.saved = bytes.to_vec();
+        true
+    }
+
+    fn load(&mut self, out: &mut [u8]) -> usize {
+        out[..self.saved.len()].copy_from_slice(&self.saved);
+        self.saved.len()
+    }
+}
+
+/// A port whose host takes so many packets and then none.
+#[derive(Default)]
+pub struct FakePort {
+    pub open: bool,
+    pub to_device: VecDeque<Vec<u8>>,
+    pub from_device: Vec<u8>,
+    pub packets: Vec<usize>,
+    /// Packets that the host still takes.
+    pub takes: usize,
+}
+
+impl Port for FakePort {
+    fn is_open(&self) -> bool {
+        self.open
+    }
+
+    fn write(&mut self, packet: &[u8]) -> bool {
+        assert!(packet.len() <= PACKET);
+        if self.takes == 0 {
+            return false;
+        }
+        self.takes -= 1;
+        self.packets.push(packet.len());
+        self.from_device.extend_from_slice(packet);
+        true
+    }
+
+    fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
+        let bytes = self.to_device.pop_front()?;
+        packet[..bytes.len()].copy_from_slice(&bytes);
+        Some(bytes.len())
+    }
+}
+
+pub struct FakeBoard<'q, const N: usize> {
+    pub capture: Capture<'q, N>,
+    pub traffic: [FakeTraffic; CHANNELS],
+    pub control: [FakeControl; CHANNELS],
+    pub clock: FakeClock,
+    pub filters: FakeFilters,
+    pub chip: FakeChip,
+}
+
+impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
+    type Traffic = FakeTraffic;
+    type Control = FakeControl;
+    type Clock = FakeClock;
+    type Filters = FakeFilters;
+    type Chip = FakeChip;
+
+    fn with_capture<R>(
+        &mut self,
+        act: impl FnOnce(&mut Capture<'q, N>, &mut [FakeTraffic; CHANNELS], &FakeClock) -> R,
+    ) -> R {
+        act(&mut self.capture, &mut self.traffic, &self.clock)
+    }
+
+    fn now(&self) -> u32 {
+        self.clock.now()
+    }
+
+    fn control(&mut self, channel: Channel) -> &mut FakeControl {
+        &mut self.control[channel.index()]
+    }
+
+    fn filters(&mut self) -> &mut FakeFilters {
+        &mut self.filters
+    }
+
+    fn chip(&mut self) -> &mut FakeChip {
+        &mut self.chip
+    }
+}
+
+/// A device of fakes with a host at its port.
+pub struct Bench<'q, const N: usize> {
+    pub board: FakeBoard<'q, N>,
+    pub session: Session<'q, N>,
+    pub port: FakePort,
+    pub decoder: Decoder,
+    pub records: Vec<(u64, Record)>,
+    pub responses: Vec<Response>,
+    /// Anything else that the decoder said.
+    pub complaints: Vec<String>,
+    decoded: usize,
+    next_id: u16,
+}
+
+impl<'q, const N: usize> Bench<'q, N> {
+    /// A device whose port is open and read.
+    pub fn new(queue: &'q RecordQueue<N>) -> Self {
+        let (producer, consumer) = queue.split();
+        let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
+        Bench {
+            board: FakeBoard {
+                capture: Capture::new(producer),
+                traffic: Default::default(),
+                control: Default::default(),
+                clock: FakeClock::default(),
+                filters: FakeFilters::default(),
+                chip: FakeChip::default(),
+            },
+            session: Session::new(consumer, identity),
+            port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
+            decoder: Decoder::new(),
+            records: Vec::new(),
+            responses: Vec::new(),
+            complaints: Vec::new(),
+            decoded: 0,
+            next_id: 1,
+        }
+    }
+
+    /// A device with a session and both channels open as `mode`.
+    pub fn opened(queue: &'q RecordQueue<N>, mode: Mode) -> Self {
+        let mut bench = Self::new(queue);
+        bench.greet();
+        for channel in Channel::ALL {
+            bench.ask(Command::Open { channel, config: Some(config(mode)) }).unwrap();
+        }
+        bench.millisecond();
+        bench.millisecond();
+        bench.records.clear();
+        bench
+    }
+
+    /// Starts a session.
+    pub fn greet(&mut self) {
+        self.say(&[0]);
+        self.ask(Command::Hello { protocol: PROTOCOL_VERSION }).unwrap();
+    }
+
+    /// Bytes from the host, in packets.
+    pub fn say(&mut self, bytes: &[u8]) {
+        self.port.to_device.extend(bytes.chunks(PACKET).map(<[u8]>::to_vec));
+        self.poll();
+    }
+
+    /// A request and its response.
+    pub fn ask(&mut self, command: Command) -> Result<Reply, Refusal> {
+        let id = self.next_id;
+        self.next_id += 1;
+        self.say(&encode(&Request { id, command }));
+        for _ in 0..500 {
+            if let Some(at) = self.responses.iter().position(|response| response.id == id) {
+                return self.responses.remove(at).result;
+            }
+            self.millisecond();
+        }
+        panic!("no response to request {id}");
+    }
+
+    /// One poll of the session, and what it sent decoded.
+    pub fn poll(&mut self) {
+        self.session.poll(&mut self.port, &mut self.board);
+        let Self { decoder, records, responses, complaints, .. } = self;
+        let bytes = &self.port.from_device[self.decoded..];
+        decoder.push(bytes, |decoded| match decoded {
+            Decoded::Record { ticks, record } => records.push((ticks, record)),
+            Decoded::Response(response) => responses.push(response.clone()),
+            other => complaints.push(format!("{other:?}")),
+        });
+        self.decoded = self.port.from_device.len();
+        if self.responses.iter().any(|response| matches!(response.result, Ok(Reply::Hello(_)))) {
+            self.decoder.restart();
+        }
+    }
+
+    /// A millisecond passes.
+    pub fn millisecond(&mut self) {
+        self.pass(cantap_firmware::TICKS_PER_MS);
+        self.board.capture.on_tick(&mut self.board.traffic, &self.board.clock);
+        self.poll();
+    }
+
+    /// Time passes.
+    pub fn pass(&mut self, ticks: u32) {
+        self.board.clock.now.set(self.board.clock.now.get().wrapping_add(ticks));
+    }
+
+    /// A frame comes off the bus, and the interrupt takes it.
+    pub fn receive(&mut self, channel: Channel, frame: Frame) {
+        self.board.traffic[channel.index()].arrive(frame);
+        self.interrupt(channel);
+    }
+
+    /// The receive interrupt.
+    pub fn interrupt(&mut self, channel: Channel) {
+        let entered = self.board.clock.now();
+        let traffic = &mut self.board.traffic[channel.index()];
+        self.board.capture.on_receive(channel, traffic, &self.board.clock, entered);
+    }
+
+    /// The bus takes one frame, and the interrupt confirms it.
+    pub fn send_one(&mut self, channel: Channel) -> Option<Frame> {
+        let sent = self.board.traffic[channel.index()].send_one();
+        let entered = self.board.clock.now();
+        let traffic = &mut self.board.traffic[channel.index()];
+        self.board.capture.on_transmit(channel, traffic, &self.board.clock, entered);
+        sent
+    }
+
+    /// The alarm, if it is due.
+    pub fn alarm(&mut self) {
+        let now = self.board.clock.now();
+        if self.board.clock.alarm.get().is_some_and(|at| now.wrapping_sub(at) < u32::MAX / 2) {
+            self.board.capture.on_alarm(&mut self.board.traffic, &self.board.clock);
+        }
+    }
+
+    /// Received frames of a channel among the records.
+    pub fn frames(&self, channel: Channel) -> Vec<Frame> {
+        self.records
+            .iter()
+            .filter_map(|(_, record)| match record {
+                Record::Received(received) if received.channel == channel => Some(received.frame),
+                _ => None,
+            })
+            .collect()
+    }
+
+    /// Events among the records.
+    pub fn events(&self) -> Vec<Event> {
+        self.records
+            .iter()
+            .filter_map(|(_, record)| match record {
+                Record::Event(event) => Some(*event),
+                Record::Received(_) => None,
+            })
+            .collect()
+    }
+}
+
+/// A request on the wire.
+pub fn encode(request: &Request) -> Vec<u8> {
+    let mut message = [0; MAX_MESSAGE + CRC_LEN];
+    let len = postcard::to_slice(request, &mut message).unwrap().len();
+    let mut out = [0; MAX_ENCODED];
+    let len = seal(&mut message, len, &mut out).unwrap();
+    out[..len].to_vec()
+}
+
+/// 500 kbit/s in this mode.
+pub fn config(mode: Mode) -> ChannelConfig {
+    let timing = BitTiming::choose(cantap_firmware::CAN_CLOCK_HZ, 500_000, None).unwrap();
+    ChannelConfig { mode, ..ChannelConfig::listen_only(timing) }
+}
+
+/// A standard frame whose data are its number.
+pub fn numbered(number: u32) -> Frame {
+    Frame::data_frame(Id::standard(number & 0x7FF).unwrap(), &number.to_be_bytes()).unwrap()
+}

@@ -1,0 +1,218 @@
+//! The conversation between host and device, on fakes.
+
+mod fakes;
+
+use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
+use cantap_wire::message::{Filter, FrameKind, Mode, TxFrame};
+use cantap_wire::{Channel, Command, Event, PROTOCOL_VERSION, Refusal, Reply, Request};
+use fakes::{Bench, SMALL_QUEUE, config, encode, numbered};
+
+const CAN1: Channel = Channel::Can1;
+const CAN2: Channel = Channel::Can2;
+
+#[test]
+fn a_greeting_tells_what_the_device_is() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.say(&[0]);
+    let Ok(Reply::Hello(hello)) = bench.ask(Command::Hello { protocol: PROTOCOL_VERSION }) else { panic!() };
+    assert_eq!((hello.protocol, hello.channels, hello.tick_hz), (PROTOCOL_VERSION, 2, TICK_HZ));
+    assert_eq!((hello.board.as_str(), hello.serial.as_str()), ("fake", "0123456789ABCDEF"));
+    assert_eq!(hello.queue_bytes, QUEUE_BYTES as u32);
+}
+
+#[test]
+fn nothing_is_sent_before_the_host_speaks() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert!(bench.port.packets.is_empty());
+}
+
+#[test]
+fn another_protocol_version_is_refused_and_changes_nothing() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    assert_eq!(
+        bench.ask(Command::Hello { protocol: PROTOCOL_VERSION + 1 }),
+        Err(Refusal::Protocol { device: PROTOCOL_VERSION })
+    );
+    assert!(bench.board.control.iter().all(|control| control.running));
+}
+
+#[test]
+fn commands_before_the_greeting_are_refused() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.say(&[0]);
+    assert_eq!(bench.ask(Command::Status), Err(Refusal::NoSession));
+}
+
+/// Nothing is acknowledged on the bus once nobody listens.
+#[test]
+fn closing_the_port_silences_both_channels_and_empties_the_queue() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    bench.port.takes = 0;
+    bench.receive(CAN1, numbered(1));
+    bench.port.open = false;
+    bench.millisecond();
+    assert!(bench.board.control.iter().all(|control| !control.running));
+    bench.port.open = true;
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    assert!(bench.records.is_empty() && bench.port.to_device.is_empty());
+    // The next host starts afresh.
+    bench.greet();
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert_eq!((status.channels[0].frames, status.channels[0].open), (0, None));
+    assert_eq!(status.queue_bytes, 0);
+    assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
+}
+
+#[test]
+fn a_stuck_bus_does_not_keep_a_channel_from_closing() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    bench.board.control[0].stuck = true;
+    assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
+    assert_eq!(bench.board.control[0].halts, 1);
+}
+
+#[test]
+fn refused_commands_say_why_and_change_nothing() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    let frames = [TxFrame { tag: 1, frame: numbered(1), at_ticks: None }].into_iter().collect();
+    assert_eq!(bench.ask(Command::Send { channel: CAN1, frames }), Err(Refusal::ListenOnly));
+    let open = Command::Open { channel: CAN1, config: Some(config(Mode::Normal)) };
+    assert_eq!(bench.ask(open), Err(Refusal::ChannelOpen));
+    let filters = heapless::Vec::new();
+    assert_eq!(bench.ask(Command::SetFilters { channel: CAN1, filters }), Err(Refusal::ChannelOpen));
+    assert_eq!(bench.ask(Command::Recover { channel: CAN1 }), Err(Refusal::NotBusOff));
+    bench.ask(Command::Close { channel: CAN1 }).unwrap();
+    let mut bad = config(Mode::Normal);
+    bad.timing.segment2 = 0;
+    assert_eq!(bench.ask(Command::Open { channel: CAN1, config: Some(bad) }), Err(Refusal::BadTiming));
+    assert_eq!(bench.ask(Command::Open { channel: CAN1, config: None }), Err(Refusal::NothingSaved));
+    let filters =
+        [Filter { extended: false, kind: FrameKind::Any, id: 0x800, mask: 0 }].into_iter().collect();
+    assert_eq!(bench.ask(Command::SetFilters { channel: CAN1, filters }), Err(Refusal::BadId));
+    let filters = [Filter { extended: false, kind: FrameKind::Any, id: 1, mask: 1 }].into_iter().collect();
+    assert_eq!(bench.ask(Command::SetFilters { channel: CAN1, filters }), Err(Refusal::WouldDisturb));
+    assert!(bench.board.filters.written.is_empty());
+    assert_eq!(bench.board.control[1].started.len(), 1);
+}
+
+/// Noise on the port, half a command, a flood: each leaves the device answering.
+#[test]
+fn garbage_is_dropped_and_the_next_command_answered() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.say(&[0xFF; 5000]);
+    bench.say(&[1, 2, 3, 0, 0, 0, 7]);
+    bench.say(&[0]);
+    let status = encode(&Request { id: 99, command: Command::Status });
+    bench.say(&status[..status.len() / 2]);
+    bench.say(&[0]);
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert!(status.bad_requests >= 3, "{}", status.bad_requests);
+}
+
+#[test]
+fn every_request_of_a_flood_is_answered_while_nothing_is_read() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.port.takes = 0;
+    let count = 60;
+    for id in 1000..1000 + count {
+        bench.say(&encode(&Request { id, command: Command::Time }));
+    }
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    let answered: Vec<u16> = bench.responses.iter().map(|response| response.id).collect();
+    assert_eq!(answered, (1000..1000 + count).collect::<Vec<_>>());
+}
+
+/// A full last packet would leave the host waiting for more.
+#[test]
+fn a_transfer_that_ends_in_a_full_packet_is_ended_by_an_empty_one() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    let mut seen = false;
+    for number in 0..200 {
+        for _ in 0..number % 80 {
+            bench.receive(CAN1, numbered(number));
+            bench.pass(1000);
+        }
+        let before = bench.port.packets.len();
+        bench.millisecond();
+        bench.millisecond();
+        if let Some(full) = bench.port.packets[before..].iter().rposition(|&len| len == 64) {
+            assert!(before + full + 1 < bench.port.packets.len(), "a full packet was the last");
+            seen |= bench.port.packets.last() == Some(&0);
+        }
+    }
+    assert!(seen, "no transfer ended in a full packet");
+}
+
+#[test]
+fn saved_defaults_open_a_channel_after_a_power_cycle() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.greet();
+    let filters: heapless::Vec<_, 56> =
+        [Filter { extended: true, kind: FrameKind::Data, id: 0x123, mask: 0x1FFF_FFFF }]
+            .into_iter()
+            .collect();
+    bench.ask(Command::SetFilters { channel: CAN2, filters }).unwrap();
+    bench.ask(Command::Open { channel: CAN2, config: Some(config(Mode::Loopback)) }).unwrap();
+    assert_eq!(bench.ask(Command::SaveDefaults), Err(Refusal::ChannelOpen));
+    bench.ask(Command::Close { channel: CAN2 }).unwrap();
+    bench.ask(Command::SaveDefaults).unwrap();
+    let saved = bench.board.chip.saved.clone();
+
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.board.chip.saved = saved;
+    bench.greet();
+    assert_eq!(
+        bench.ask(Command::Open { channel: CAN2, config: None }),
+        Ok(Reply::Opened(config(Mode::Loopback)))
+    );
+    let layout = bench.board.filters.written.last().unwrap();
+    assert_eq!(layout.used(CAN2), 1);
+    assert_ne!(layout.banks[14].unwrap().second, 0);
+    assert_eq!(bench.ask(Command::Open { channel: CAN1, config: None }), Err(Refusal::NothingSaved));
+    bench.ask(Command::ClearDefaults).unwrap();
+    assert!(bench.board.chip.saved.is_empty());
+}
+
+#[test]
+fn a_restart_is_answered_before_it_happens() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    assert_eq!(bench.ask(Command::Reset), Ok(Reply::Done));
+    assert_eq!(bench.board.chip.resets, 0);
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert_eq!(bench.board.chip.resets, 1);
+}
+
+#[test]
+fn opening_and_closing_one_channel_leaves_the_other_alone() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.ask(Command::Close { channel: CAN1 }).unwrap();
+    bench.receive(CAN2, numbered(7));
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::Normal)) }).unwrap();
+    bench.millisecond();
+    assert_eq!(bench.frames(CAN2), [numbered(7)]);
+    assert_eq!(bench.board.control[1].started.len(), 1);
+    assert!(bench.board.filters.written.is_empty());
+    assert_eq!(bench.events(), [Event::Stopped { channel: CAN1 }, Event::Started { channel: CAN1 }]);
+}

@@ -2,6 +2,8 @@
 //! features, so that a program that only captures stays small.
 
 pub mod bits;
+#[cfg(feature = "stats")]
+pub mod stats;
 pub mod trace;
 
 pub use bits::{FrameBits, bits_on_bus};

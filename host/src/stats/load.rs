@@ -1,0 +1,486 @@
+//! How busy a bus is: the work load between two frames, and the load of equal windows of time.
+//!
+//! Both count exact bits. A frame occupies the bus from its start of frame to the end of the
+//! intermission behind it; its time stamp is its end, before the intermission.
+
+use std::collections::VecDeque;
+
+use crate::bits::INTERMISSION_BITS;
+
+/// Bits that an error frame takes at least: a flag of six, a delimiter of eight, and the intermission. The
+/// flags of several nodes may stretch it by six, and what was sent of the frame it destroyed is unknown, so a
+/// load with errors is a lower bound.
+pub const ERROR_FRAME_BITS: u32 = 6 + 8 + INTERMISSION_BITS;
+
+/// Bits of the longest classical frame, all stuff bits included, with its intermission.
+const LONGEST_FRAME_BITS: u64 = 160;
+
+/// Nanoseconds that `bits` take, rounded to the nearest.
+pub(super) fn bits_to_ns(bits: u64, bitrate_bps: u32) -> u64 {
+    let bitrate = u64::from(bitrate_bps);
+    (bits * 1_000_000_000 + bitrate / 2) / bitrate
+}
+
+/// The shortest window that a frame cannot outlast at this bit rate, in nanoseconds.
+pub fn shortest_window_ns(bitrate_bps: u32) -> u64 {
+    bits_to_ns(LONGEST_FRAME_BITS, bitrate_bps.max(1))
+}
+
+/// The work load of one channel, as the earlier analyser defined it: frame time plus intermission, over the
+/// time between two arrivals.
+#[derive(Clone, Debug)]
+pub struct WorkLoad {
+    bitrate_bps: u32,
+    previous_ns: Option<i64>,
+    instant_pct: Option<f64>,
+    instant_max_pct: Option<f64>,
+    bits: u64,
+    span_ns: u64,
+}
+
+impl WorkLoad {
+    /// Nothing seen yet. `bitrate_bps` must not be zero; it is taken as 1 then.
+    pub fn new(bitrate_bps: u32) -> Self {
+        Self {
+            bitrate_bps: bitrate_bps.max(1),
+            previous_ns: None,
+            instant_pct: None,
+            instant_max_pct: None,
+            bits: 0,
+            span_ns: 0,
+        }
+    }
+
+    /// Takes a frame that ended at `end_ns` and takes `bits` on the bus, intermission included.
+    #[inline]
+    pub fn frame(&mut self, end_ns: i64, bits: u32) {
+        if let Some(previous) = self.previous_ns.replace(end_ns)
+            && let Ok(interval @ 1..) = u64::try_from(end_ns.saturating_sub(previous))
+        {
+            let instant = self.share(u64::from(bits), interval);
+            self.instant_pct = Some(instant);
+            self.instant_max_pct = Some(self.instant_max_pct.map_or(instant, |max| max.max(instant)));
+            self.bits += u64::from(bits);
+            // A file may say anything about times.
+            self.span_ns = self.span_ns.saturating_add(interval);
+        }
+    }
+
+    /// Frames are missing here: the interval that spans them says nothing and is left out.
+    pub fn gap(&mut self) {
+        self.previous_ns = None;
+        self.instant_pct = None;
+    }
+
+    /// Load of the last frame over its interval, in per cent; `None` before the second frame and after a gap.
+    /// Never above 100: a late stamp makes the next interval too short.
+    pub fn instant_pct(&self) -> Option<f64> {
+        self.instant_pct
+    }
+
+    /// The largest [`Self::instant_pct`] so far.
+    pub fn instant_max_pct(&self) -> Option<f64> {
+        self.instant_max_pct
+    }
+
+    /// Load over all intervals, in per cent; `None` before the second frame.
+    pub fn mean_pct(&self) -> Option<f64> {
+        (self.span_ns > 0).then(|| self.share(self.bits, self.span_ns))
+    }
+
+    fn share(&self, bits: u64, span_ns: u64) -> f64 {
+        let share = bits as f64 * 1e11 / (f64::from(self.bitrate_bps) * span_ns as f64);
+        share.min(100.0)
+    }
+}
+
+/// One window of time on one channel.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Window {
+    /// Channel, from 1.
+    pub channel: u8,
+    /// Where it begins, in nanoseconds as in [`crate::TraceRecord::time_ns`].
+    pub start_ns: i64,
+    /// How long it is. The last window of a trace is cut short where the trace ends.
+    pub length_ns: u64,
+    /// Frames that ended in it.
+    pub frames: u64,
+    /// Their bits, with stuff bits and intermission.
+    pub bits: u64,
+    /// Error frames seen in it.
+    pub errors: u64,
+    /// Frames lost in it: with any, the load is a lower bound.
+    pub lost: u64,
+    /// Load in per cent, frames that cross its borders in part, error frames with their least length; `None`
+    /// without a bit rate.
+    pub load_pct: Option<f64>,
+    busy_ns: u64,
+}
+
+impl Window {
+    fn new(channel: u8, start_ns: i64, length_ns: u64) -> Self {
+        Self {
+            channel,
+            start_ns,
+            length_ns,
+            frames: 0,
+            bits: 0,
+            errors: 0,
+            lost: 0,
+            load_pct: None,
+            busy_ns: 0,
+        }
+    }
+
+    fn is_empty(&self) -> bool {
+        self.busy_ns == 0 && self.frames + self.errors + self.lost == 0
+    }
+
+    /// Frames per second.
+    pub fn frames_per_s(&self) -> f64 {
+        per_second(self.frames, self.length_ns)
+    }
+
+    /// Bits per second, with stuff bits and intermission, error frames left out.
+    pub fn bits_per_s(&self) -> f64 {
+        per_second(self.bits, self.length_ns)
+    }
+}
+
+/// `count` over `length_ns`, as a rate per second; zero over no time.
+pub(super) fn per_second(count: u64, length_ns: u64) -> f64 {
+    if length_ns == 0 { 0.0 } else { count as f64 * 1e9 / length_ns as f64 }
+}
+
+/// Cuts one channel's time into equal windows and keeps the extremes of the whole ones.
+#[derive(Clone, Debug)]
+pub(super) struct Windows {
+    length_ns: u64,
+    bitrate_bps: Option<u32>,
+    current: Window,
+    /// What of a frame's intermission reaches into the next window.
+    carry_ns: u64,
+    /// A window that waits for a frame that may have begun in it.
+    pending: Option<Window>,
+    peaks: Peaks,
+    whole: u64,
+    load_min: f64,
+    load_sum: f64,
+}
+
+impl Windows {
+    pub(super) fn new(
+        channel: u8,
+        origin_ns: i64,
+        length_ns: u64,
+        bitrate_bps: Option<u32>,
+        peaks: usize,
+    ) -> Self {
+        Self {
+            length_ns,
+            bitrate_bps,
+            current: Window::new(channel, origin_ns, length_ns),
+            carry_ns: 0,
+            pending: None,
+            peaks: Peaks::new(peaks),
+            whole: 0,
+            load_min: f64::INFINITY,
+            load_sum: 0.0,
+        }
+    }
+
+    /// Time has come to `now_ns`: closes every window that ended before.
+    #[inline]
+    pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        let ahead = now_ns.saturating_sub(self.current.start_ns);
+        if ahead >= self.length_ns as i64 {
+            self.advance_slowly(now_ns, closed);
+        } else if ahead < -(self.length_ns as i64) {
+            self.start_over(now_ns, closed);
+        }
+    }
+
+    /// The trace's clock was set back, as where two logs were joined: the grid begins anew at `now_ns`.
+    #[cold]
+    fn start_over(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        self.close_pending(closed);
+        self.carry_ns = 0;
+        let window = Window::new(self.current.channel, now_ns, self.length_ns);
+        let mut cut = std::mem::replace(&mut self.current, window);
+        self.finish_load(&mut cut);
+        closed(&cut);
+    }
+
+    #[cold]
+    fn advance_slowly(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        let length = self.length_ns as i64;
+        let mut steps = now_ns.saturating_sub(self.current.start_ns) / length;
+        while steps > 0 {
+            // Hours of silence are as many equal empty windows: counted, but not reported one by one.
+            if steps > MOST_SILENT_WINDOWS && self.current.is_empty() {
+                let silent = steps - 1;
+                self.whole += silent as u64;
+                self.load_min = 0.0;
+                self.current.start_ns = self.current.start_ns.saturating_add(silent * length);
+                steps = 1;
+            }
+            self.close_pending(closed);
+            let start = self.current.start_ns.saturating_add(length);
+            let mut window = Window::new(self.current.channel, start, self.length_ns);
+            window.busy_ns = std::mem::take(&mut self.carry_ns);
+            self.pending = Some(std::mem::replace(&mut self.current, window));
+            steps -= 1;
+        }
+    }
+
+    /// A frame of `bits` that ended at `end_ns`. [`Self::advance`] to `end_ns` comes first.
+    #[inline]
+    pub(super) fn frame(&mut self, end_ns: i64, bits: u32, closed: &mut impl FnMut(&Window)) {
+        self.current.frames += 1;
+        self.current.bits += u64::from(bits);
+        let Some(bitrate) = self.bitrate_bps else {
+            return self.close_pending(closed);
+        };
+        // Relative to the window's start, so that no file's times overflow.
+        let end = end_ns.saturating_sub(self.current.start_ns).clamp(-1, self.length_ns as i64);
+        let start = end - bits_to_ns(u64::from(bits - INTERMISSION_BITS), bitrate) as i64;
+        let stop = start + bits_to_ns(u64::from(bits), bitrate) as i64;
+        // A stamp from the past (traces that are merged badly) counts whole where it arrives.
+        let before = if end < 0 { 0 } else { (-start).max(0) };
+        let after = (stop - self.length_ns as i64).max(0);
+        self.current.busy_ns += (stop - start - before - after) as u64;
+        self.carry_ns += after as u64;
+        if let Some(pending) = &mut self.pending {
+            pending.busy_ns += before as u64;
+        }
+        self.close_pending(closed);
+    }
+
+    /// Error frames that were seen.
+    pub(super) fn errors(&mut self, count: u64) {
+        self.current.errors += count;
+        if let Some(bitrate) = self.bitrate_bps {
+            self.current.busy_ns += bits_to_ns(count * u64::from(ERROR_FRAME_BITS), bitrate);
+        }
+    }
+
+    /// Frames that were lost.
+    pub(super) fn lost(&mut self, count: u64) {
+        self.current.lost += count;
+    }
+
+    fn close_pending(&mut self, closed: &mut impl FnMut(&Window)) {
+        let Some(mut window) = self.pending.take() else {
+            return;
+        };
+        self.finish_load(&mut window);
+        self.whole += 1;
+        if let Some(load) = window.load_pct {
+            self.load_min = self.load_min.min(load);
+            self.load_sum += load;
+        }
+        self.peaks.offer(&window);
+        closed(&window);
+    }
+
+    fn finish_load(&self, window: &mut Window) {
+        window.load_pct = self
+            .bitrate_bps
+            .filter(|_| window.length_ns > 0)
+            .map(|_| (window.busy_ns as f64 * 100.0 / window.length_ns as f64).min(100.0));
+    }
+
+    /// The window that is still running, as far as `now_ns`.
+    pub(super) fn running(&self, now_ns: i64) -> Window {
+        let mut window = self.current;
+        window.length_ns =
+            u64::try_from(now_ns.saturating_sub(window.start_ns)).unwrap_or(0).min(self.length_ns);
+        self.finish_load(&mut window);
+        window
+    }
+
+    /// The trace ends at `now_ns`: closes what is whole, and the rest, cut short, without counting it among
+    /// the extremes unless it is all there is.
+    pub(super) fn finish(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        self.advance(now_ns, closed);
+        self.close_pending(closed);
+        let rest = self.running(now_ns);
+        if rest.frames + rest.errors + rest.lost == 0 {
+            return;
+        }
+        if self.whole == 0 {
+            self.peaks.offer(&rest);
+            if let Some(load) = rest.load_pct {
+                self.whole = 1;
+                self.load_min = load;
+                self.load_sum = load;
+            }
+        }
+        closed(&rest);
+    }
+
+    /// Least, mean and largest load of the whole windows, in per cent.
+    pub(super) fn extremes(&self) -> Option<(f64, f64, f64)> {
+        let max = self.peaks.best.front()?.load_pct?;
+        Some((self.load_min, self.load_sum / self.whole.max(1) as f64, max))
+    }
+
+    /// The busiest windows, the busiest first.
+    pub(super) fn peaks(&self) -> impl Iterator<Item = &Window> {
+        self.peaks.best.iter()
+    }
+}
+
+/// Silent windows that are reported one by one; a longer silence is counted.
+const MOST_SILENT_WINDOWS: i64 = 86_400;
+
+/// The busiest windows: by load, or by frames where no bit rate is known.
+#[derive(Clone, Debug)]
+struct Peaks {
+    most: usize,
+    best: VecDeque<Window>,
+}
+
+impl Peaks {
+    fn new(most: usize) -> Self {
+        Self { most: most.max(1), best: VecDeque::new() }
+    }
+
+    fn offer(&mut self, window: &Window) {
+        let busier = |other: &Window| (other.load_pct, other.frames) >= (window.load_pct, window.frames);
+        let place = self.best.iter().position(|other| !busier(other)).unwrap_or(self.best.len());
+        if place < self.most {
+            self.best.insert(place, *window);
+            self.best.truncate(self.most);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn back_to_back_frames_measured_a_timer_tick_apart_give_the_golden_work_load() {
+        let mut load = WorkLoad::new(1_000_000);
+        for n in 0..10 {
+            load.frame(n * 58_125, 58);
+        }
+        let golden = 100.0 * 58.0 / 58.125;
+        assert!((load.instant_pct().unwrap() - golden).abs() < 1e-9);
+        assert!((load.mean_pct().unwrap() - golden).abs() < 1e-9);
+        assert_eq!(format!("{:.3}", load.mean_pct().unwrap()), "99.785");
+    }
+
+    #[test]
+    fn bursts_of_five_every_1919_us_give_the_golden_mean() {
+        let mut load = WorkLoad::new(1_000_000);
+        for burst in 0..2000 {
+            for frame in 0..5 {
+                load.frame(burst * 1_919_600 + frame * 58_000, 58);
+            }
+        }
+        // The first frame has no interval before it, so the mean converges from above.
+        assert_eq!(format!("{:.1}", load.mean_pct().unwrap()), "15.1");
+        assert!((load.instant_pct().unwrap() - 100.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn the_work_load_never_passes_100_and_leaves_gaps_out() {
+        let mut load = WorkLoad::new(1_000_000);
+        load.frame(0, 58);
+        assert_eq!(load.instant_pct(), None);
+        load.frame(40_000, 58);
+        assert_eq!(load.instant_pct(), Some(100.0));
+        load.gap();
+        load.frame(10_000_000, 58);
+        assert_eq!(load.instant_pct(), None);
+        load.frame(10_116_000, 58);
+        assert_eq!(load.instant_pct(), Some(50.0));
+        // Stamps that do not advance say nothing.
+        load.frame(10_116_000, 58);
+        assert_eq!(load.instant_pct(), Some(50.0));
+    }
+
+    fn windows(bitrate_bps: u32) -> Windows {
+        Windows::new(1, 0, 1_000_000, Some(bitrate_bps), 3)
+    }
+
+    #[test]
+    fn a_frame_across_a_border_counts_in_both_windows() {
+        let mut windows = windows(1_000_000);
+        let mut seen = Vec::new();
+        // 103 bits: 30 µs of it before the border, 70 behind, and 3 of intermission.
+        windows.advance(1_070_000, &mut |window| seen.push(*window));
+        windows.frame(1_070_000, 103, &mut |window| seen.push(*window));
+        windows.finish(2_000_000, &mut |window| seen.push(*window));
+        let loads: Vec<_> = seen.iter().map(|window| window.load_pct.unwrap()).collect();
+        assert_eq!(loads, [3.0, 7.3]);
+        assert_eq!(seen[0].frames, 0);
+        assert_eq!(seen[1].frames, 1);
+    }
+
+    #[test]
+    fn a_saturated_bus_fills_every_window() {
+        let mut windows = windows(1_000_000);
+        let mut loads = Vec::new();
+        for n in 1..=1000 {
+            let end = n * 58_000 - 3_000;
+            windows.advance(end, &mut |window| loads.push(window.load_pct.unwrap()));
+            windows.frame(end, 58, &mut |window| loads.push(window.load_pct.unwrap()));
+        }
+        assert_eq!(loads.len(), 57);
+        assert!(loads.iter().all(|load| (load - 100.0).abs() < 1e-9), "{loads:?}");
+    }
+
+    #[test]
+    fn error_frames_add_their_least_length() {
+        let mut windows = windows(1_000_000);
+        windows.errors(10);
+        let mut loads = Vec::new();
+        windows.finish(1_000_000, &mut |window| loads.push(window.load_pct.unwrap()));
+        assert_eq!(loads, [17.0]);
+    }
+
+    #[test]
+    fn a_year_of_silence_costs_no_time_and_keeps_the_windows_grid() {
+        let mut windows = windows(1_000_000);
+        let year = 365 * 86_400 * 1_000_000_000;
+        let mut count = 0u64;
+        windows.frame(500_000, 58, &mut |_| count += 1);
+        windows.advance(year + 250_000, &mut |_| count += 1);
+        windows.frame(year + 250_000, 58, &mut |_| count += 1);
+        let running = windows.running(year + 300_000);
+        assert_eq!((running.start_ns, running.frames), (year, 1));
+        assert!(count < 200_000, "{count}");
+        assert_eq!(windows.whole, year as u64 / 1_000_000);
+        let (min, mean, max) = windows.extremes().unwrap();
+        assert!(min.abs() < 1e-12 && mean < 1e-6 && (max - 5.8).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_starts_a_new_grid() {
+        let mut windows = windows(1_000_000);
+        let mut seen = Vec::new();
+        for end in [9_500_000, 2_250_000, 3_250_000, 4_300_000] {
+            windows.advance(end, &mut |window| seen.push((window.start_ns, window.frames)));
+            windows.frame(end, 58, &mut |window| seen.push((window.start_ns, window.frames)));
+        }
+        assert_eq!(seen[8..], [(8_000_000, 0), (9_000_000, 1), (2_250_000, 1), (3_250_000, 1)]);
+    }
+
+    #[test]
+    fn peaks_are_the_busiest_windows_in_order() {
+        let mut windows = windows(1_000_000);
+        for (window, frames) in [(0, 3), (1, 9), (2, 1), (3, 5)] {
+            for frame in 1..=frames {
+                let end = window * 1_000_000 + frame * 100_000;
+                windows.advance(end, &mut |_| {});
+                windows.frame(end, 58, &mut |_| {});
+            }
+        }
+        windows.finish(4_000_000, &mut |_| {});
+        let peaks: Vec<_> = windows.peaks().map(|window| window.frames).collect();
+        assert_eq!(peaks, [9, 5, 3]);
+    }
+}

@@ -1,0 +1,116 @@
+//! The collector as a whole.
+
+use super::*;
+use crate::{Direction, TraceEvent};
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
+
+fn at(time_us: i64, channel: u8, event: TraceEvent) -> TraceRecord {
+    TraceRecord { time_ns: time_us * 1000, channel, event }
+}
+
+fn frame(time_us: i64, channel: u8, text: &str) -> TraceRecord {
+    let frame = text.parse().unwrap();
+    at(time_us, channel, TraceEvent::Frame { frame, direction: Direction::Rx, late: false })
+}
+
+fn at_1_mbit() -> Statistics {
+    Statistics::new(Options { bitrate_bps: Some(1_000_000), ..Options::default() }).unwrap()
+}
+
+#[test]
+fn the_golden_burst_of_ten_frames_agrees() {
+    let mut statistics = at_1_mbit();
+    // ID 0, DLC 1, data 0x55: 58 µs per frame.
+    for n in 0..10 {
+        statistics.push(&frame(n * 58, 1, "000#55"));
+    }
+    let summary = statistics.summary();
+    let channel = &summary.channels[0];
+    assert_eq!((channel.bits, channel.bus_load_pct), (580, Some(100.0)));
+    assert!((channel.bits_per_s - 1e6).abs() < 1e-6);
+    assert!((channel.frames_per_s - 1e6 / 58.0).abs() < 1e-6);
+}
+
+#[test]
+fn a_loss_counts_by_stage_and_interrupts_load_and_period() {
+    let mut statistics = at_1_mbit();
+    statistics.push(&frame(0, 1, "000#55"));
+    statistics.push(&frame(116, 1, "000#55"));
+    statistics.push(&at(
+        5000,
+        1,
+        TraceEvent::Lost { stage: Some(LossStage::Queue), count: 80, at_least: false },
+    ));
+    statistics.push(&at(5000, 1, TraceEvent::Lost { stage: None, count: 3, at_least: true }));
+    statistics.push(&frame(5058, 1, "000#55"));
+    statistics.push(&frame(5174, 1, "000#55"));
+    let summary = statistics.summary();
+    let channel = &summary.channels[0];
+    assert_eq!((summary.lost, channel.lost.queue, channel.lost.unknown, channel.lost.gaps), (83, 80, 3, 2));
+    assert!(channel.lost.at_least);
+    assert_eq!(channel.bus_load_pct, Some(50.0));
+    assert_eq!(channel.ids[0].period_max_ms, Some(0.116));
+}
+
+#[test]
+fn errors_and_states_are_counted_by_kind() {
+    let mut statistics = at_1_mbit();
+    let error = TraceEvent::BusError { kind: Some(BusErrorKind::Stuff), counters: Some((0, 9)) };
+    statistics.push(&at(0, 2, error));
+    statistics.push(&at(1, 2, TraceEvent::ErrorsSuppressed { count: 41 }));
+    statistics.push(&at(2, 2, TraceEvent::State { state: ErrorState::Passive, counters: None }));
+    let summary = statistics.summary();
+    let channel = &summary.channels[0];
+    assert_eq!((channel.channel, channel.errors.total, channel.errors.stuff), (2, 42, 1));
+    assert_eq!((channel.state, channel.error_counters), (Some("error-passive"), Some((0, 9))));
+    assert_eq!(channel.bus_load_pct, None);
+}
+
+#[test]
+fn each_channel_has_its_own_bit_rate_and_shares_the_window_grid() {
+    let options = Options {
+        bitrate_bps: Some(1_000_000),
+        channel_bitrate_bps: vec![(2, 500_000)],
+        window: Duration::from_millis(1),
+        ..Options::default()
+    };
+    let mut statistics = Statistics::new(options).unwrap();
+    let mut starts = Vec::new();
+    for n in 0..20 {
+        statistics.push_with(&frame(55 + n * 116, 1, "000#55"), |window| starts.push(window.start_ns));
+        statistics.push_with(&frame(60 + n * 116, 2, "000#55"), |window| starts.push(window.start_ns));
+    }
+    assert_eq!(starts, [0, 0, 1_000_000, 1_000_000]);
+    let loads: Vec<_> = statistics.summary().channels.iter().map(|channel| channel.bus_load_pct).collect();
+    assert_eq!(loads, [Some(50.0), Some(100.0)]);
+}
+
+#[test]
+fn options_that_cannot_work_are_refused_with_the_reason() {
+    let slow = Options { bitrate_bps: Some(10_000), window: Duration::from_millis(10), ..Options::default() };
+    let reason = Statistics::new(slow).unwrap_err();
+    assert_eq!(reason, BadOptions::WindowTooShort { bitrate_bps: 10_000, shortest_us: 16_000 });
+    let zero = Options { channel_bitrate_bps: vec![(1, 0)], ..Options::default() };
+    assert_eq!(Statistics::new(zero).unwrap_err(), BadOptions::ZeroBitrate);
+}
+
+/// Files may say anything.
+#[test]
+fn no_time_however_wild_makes_it_panic() {
+    let mut statistics = at_1_mbit();
+    for time_ns in [0, i64::MAX, i64::MIN, -1, i64::MAX - 1, i64::MIN + 1, 5_000_000_000, 0] {
+        statistics.push(&TraceRecord { time_ns, ..frame(0, 1, "000#55") });
+        statistics.push(&TraceRecord { time_ns, ..frame(0, 200, "1FFFFFFF#R8") });
+    }
+    statistics.finish();
+    assert_eq!(statistics.summary().frames, 16);
+}
+
+#[test]
+fn an_empty_trace_has_an_empty_summary() {
+    let mut statistics = at_1_mbit();
+    statistics.finish();
+    let summary = statistics.summary();
+    assert_eq!((summary.frames, summary.first_s, summary.channels.len()), (0, None, 0));
+    assert_eq!(statistics.last_ns(), None);
+}

@@ -2,6 +2,7 @@
 //! features, so that a program that only captures stays small.
 
 pub mod bits;
+pub mod device;
 #[cfg(feature = "stats")]
 pub mod stats;
 pub mod trace;
@@ -9,4 +10,5 @@ pub mod trace;
 pub use bits::{FrameBits, bits_on_bus};
 pub use cantap_wire as wire;
 pub use cantap_wire::{Channel, Frame, Id};
+pub use device::{Address, Device, DeviceError};
 pub use trace::{Direction, TraceEvent, TraceRecord};

@@ -1,0 +1,309 @@
+//! Bytes in, trace records out: decodes a device's stream, tightens stamps, maps them to UTC and counts.
+//! No threads, no I/O: the reader thread drives it, and so do tests and the benchmark.
+
+use std::time::Instant;
+
+use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
+use cantap_wire::{CHANNELS, Channel, Decoded, Decoder, Frame, Reply, Response};
+
+use super::clock::{ClockMap, UtcClock};
+use super::stamps::{BitLengths, tighten};
+use crate::{Direction, TraceEvent, TraceRecord};
+
+/// Bytes decoded at a time: their records stay in the processor's cache through every pass.
+pub const PIECE_BYTES: usize = 4096;
+
+/// What was received and lost on one channel since the session began.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct ChannelCounters {
+    /// Frames that arrived from the device.
+    pub received: u64,
+    /// Times the controller's FIFO overran: at least so many frames were lost.
+    pub lost_controller: u64,
+    /// Frames that found the device's queue full.
+    pub lost_queue: u64,
+    /// Frames lost between device and host.
+    pub lost_link: u64,
+    /// Frames that arrived and that a slow consumer lost.
+    pub lost_host: u64,
+}
+
+impl ChannelCounters {
+    /// Frames handed to the consumer.
+    pub const fn delivered(&self) -> u64 {
+        self.received - self.lost_host
+    }
+
+    /// Frames lost at any stage.
+    pub const fn lost(&self) -> u64 {
+        self.lost_controller + self.lost_queue + self.lost_link + self.lost_host
+    }
+}
+
+/// What was received and lost since the session began.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counters {
+    /// Each channel.
+    pub channels: [ChannelCounters; CHANNELS],
+    /// Bytes that came from the device.
+    pub bytes: u64,
+    /// Messages thrown away because they were damaged. What was in them is counted as lost on the link.
+    pub corrupt: u64,
+}
+
+/// How a transmission ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Transmission {
+    /// Where.
+    pub channel: Channel,
+    /// The request's tag.
+    pub tag: u32,
+    /// Device time, in ticks.
+    pub ticks: u64,
+    /// UTC in nanoseconds since the Unix epoch.
+    pub time_ns: i64,
+    /// The frame as sent, or why not.
+    pub result: Result<Frame, TransmitFailure>,
+}
+
+/// What else the stream says, beside records.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Notice {
+    /// An answer.
+    Response(Response),
+    /// The device speaks this other version.
+    OtherProtocol(u16),
+    /// Nothing more follows of this channel.
+    Stopped(Channel),
+    /// A transmission ended.
+    Transmission(Transmission),
+}
+
+/// One device's stream.
+pub struct Intake {
+    decoder: Decoder,
+    records: Vec<TraceRecord>,
+    lengths: BitLengths,
+    clock: ClockMap,
+    utc: UtcClock,
+    /// The last record's time.
+    last_ns: i64,
+    counters: Counters,
+    /// `Hello` was answered; what came before belongs to somebody else's session.
+    in_session: bool,
+}
+
+impl Intake {
+    /// An intake that waits for the answer to `Hello`.
+    pub fn new() -> Self {
+        let utc = UtcClock::start();
+        Self {
+            decoder: Decoder::new(),
+            records: Vec::new(),
+            lengths: BitLengths::default(),
+            clock: ClockMap::new(cantap_tick_hz_before_hello(), utc.at(Instant::now())),
+            utc,
+            last_ns: i64::MIN,
+            counters: Counters::default(),
+            in_session: false,
+        }
+    }
+
+    /// Takes at most [`PIECE_BYTES`] (more is fine, and slower), reports notices, and returns the records, to
+    /// be taken out of the vector.
+    pub fn push(&mut self, bytes: &[u8], mut notice: impl FnMut(Notice)) -> &mut Vec<TraceRecord> {
+        let Self { decoder, records, counters, clock, in_session, .. } = self;
+        let mut hello = None;
+        let mut last_ticks = None;
+        counters.bytes += bytes.len() as u64;
+        decoder.push(bytes, |decoded| match decoded {
+            Decoded::Record { .. } | Decoded::BatchesLost { .. } if !*in_session => {}
+            Decoded::Record { ticks, record: Record::Received(received) } => {
+                last_ticks = Some(ticks);
+                counters.channels[received.channel.index()].received += 1;
+                records.push(TraceRecord {
+                    time_ns: ticks as i64,
+                    channel: received.channel.number(),
+                    event: TraceEvent::Frame {
+                        frame: received.frame,
+                        direction: Direction::Rx,
+                        late: received.stamp != Stamp::Exact,
+                    },
+                });
+            }
+            Decoded::Record { ticks, record: Record::Event(event) } => {
+                last_ticks = Some(ticks);
+                on_event(event, ticks, counters, clock, records, &mut notice);
+            }
+            Decoded::BatchesLost { frames, .. } => {
+                for (channel, count) in Channel::ALL.into_iter().zip(frames) {
+                    counters.channels[channel.index()].lost_link += u64::from(count);
+                    // Its time is known when the next record is; zero stands for "not earlier than the last".
+                    let ticks = last_ticks.unwrap_or(0);
+                    records.extend(lost(channel, ticks, LossStage::Link, count, false));
+                }
+            }
+            Decoded::Response(response) => {
+                if let Ok(Reply::Hello(answer)) = &response.result {
+                    hello = Some(answer.tick_hz);
+                }
+                notice(Notice::Response(response.clone()));
+            }
+            Decoded::Corrupt(_) => counters.corrupt += 1,
+            Decoded::OtherProtocol(version) => notice(Notice::OtherProtocol(version)),
+        });
+        if let Some(tick_hz) = hello {
+            self.begin_session(tick_hz);
+        } else {
+            self.place_in_time();
+        }
+        &mut self.records
+    }
+
+    /// A device that answered `Hello` sends nothing more until a channel is opened: what stands before belongs
+    /// to a session that is over.
+    fn begin_session(&mut self, tick_hz: u32) {
+        self.decoder.restart();
+        self.records.clear();
+        self.counters = Counters::default();
+        self.clock = ClockMap::new(tick_hz, self.utc.at(Instant::now()));
+        self.last_ns = i64::MIN;
+        self.lengths = BitLengths::default();
+        self.in_session = true;
+    }
+
+    /// Tightens the new records, maps them to UTC and puts them in order. A channel whose stamps were moved
+    /// back may now stand before the other's; nothing moves to before what was already handed over.
+    fn place_in_time(&mut self) {
+        tighten(&mut self.records, &self.lengths);
+        let mut sorted = true;
+        let mut previous = self.last_ns;
+        for record in &mut self.records {
+            record.time_ns = self.clock.utc_ns(record.time_ns as u64).max(self.last_ns);
+            sorted &= record.time_ns >= previous;
+            previous = record.time_ns;
+        }
+        if !sorted {
+            self.sort();
+        }
+        if let Some(last) = self.records.last() {
+            self.last_ns = last.time_ns;
+        }
+    }
+
+    /// Orders by time and keeps each channel's order: no record goes before one of its own channel.
+    fn sort(&mut self) {
+        let mut latest = [i64::MIN; CHANNELS];
+        for record in &mut self.records {
+            let latest = &mut latest[usize::from(record.channel == 2)];
+            record.time_ns = record.time_ns.max(*latest);
+            *latest = record.time_ns;
+        }
+        self.records.sort_by_key(|record| record.time_ns);
+    }
+
+    /// Adds a round trip of the clock.
+    pub fn add_time(&mut self, ticks: u64, asked: Instant, answered: Instant) {
+        self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
+    }
+
+    /// The clock's map, to be read or settled.
+    pub fn clock(&mut self) -> &mut ClockMap {
+        &mut self.clock
+    }
+
+    /// The bits' lengths, to be set when a channel opens.
+    pub fn lengths(&mut self) -> &mut BitLengths {
+        &mut self.lengths
+    }
+
+    /// Whether `Hello` was answered.
+    pub const fn is_in_session(&self) -> bool {
+        self.in_session
+    }
+
+    /// What was counted.
+    pub const fn counters(&self) -> &Counters {
+        &self.counters
+    }
+
+    /// Counts frames that the consumer lost.
+    pub fn count_host_losses(&mut self, lost: [u32; CHANNELS]) {
+        for (channel, lost) in self.counters.channels.iter_mut().zip(lost) {
+            channel.lost_host += u64::from(lost);
+        }
+    }
+
+    /// Adds losses that only the device's own counters tell of, at the end of a session.
+    pub fn add_losses(&mut self, channel: Channel, stage: LossStage, count: u32) -> &mut Vec<TraceRecord> {
+        let counters = &mut self.counters.channels[channel.index()];
+        match stage {
+            LossStage::Controller => counters.lost_controller += u64::from(count),
+            LossStage::Queue => counters.lost_queue += u64::from(count),
+            LossStage::Link => counters.lost_link += u64::from(count),
+            LossStage::Host => counters.lost_host += u64::from(count),
+        }
+        self.records.extend(lost(channel, 0, stage, count, stage == LossStage::Controller));
+        self.place_in_time();
+        &mut self.records
+    }
+}
+
+impl Default for Intake {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// No record is kept before `Hello` tells the tick rate; any number will do.
+const fn cantap_tick_hz_before_hello() -> u32 {
+    1_000_000
+}
+
+fn lost(channel: Channel, ticks: u64, stage: LossStage, count: u32, at_least: bool) -> Option<TraceRecord> {
+    let event = TraceEvent::Lost { stage: Some(stage), count, at_least };
+    (count > 0).then_some(TraceRecord { time_ns: ticks as i64, channel: channel.number(), event })
+}
+
+/// Everything that is not a received frame.
+fn on_event(
+    event: Event,
+    ticks: u64,
+    counters: &mut Counters,
+    clock: &ClockMap,
+    records: &mut Vec<TraceRecord>,
+    notice: &mut impl FnMut(Notice),
+) {
+    let (channel, event) = match event {
+        Event::Lost { channel, stage, count, at_least } => {
+            let counters = &mut counters.channels[channel.index()];
+            match stage {
+                LossStage::Controller => counters.lost_controller += u64::from(count),
+                LossStage::Queue => counters.lost_queue += u64::from(count),
+                LossStage::Link => counters.lost_link += u64::from(count),
+                LossStage::Host => counters.lost_host += u64::from(count),
+            }
+            (channel, TraceEvent::Lost { stage: Some(stage), count, at_least })
+        }
+        Event::BusError { channel, kind, tec, rec } => {
+            (channel, TraceEvent::BusError { kind: Some(kind), counters: Some((tec, rec)) })
+        }
+        Event::ErrorsSuppressed { channel, count } => (channel, TraceEvent::ErrorsSuppressed { count }),
+        Event::State { channel, state, tec, rec } => {
+            (channel, TraceEvent::State { state, counters: Some((tec, rec)) })
+        }
+        Event::Transmitted { channel, tag, frame } => {
+            let time_ns = clock.utc_ns(ticks);
+            notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
+            (channel, TraceEvent::Frame { frame, direction: Direction::Tx, late: false })
+        }
+        Event::TransmitFailed { channel, tag, reason } => {
+            let time_ns = clock.utc_ns(ticks);
+            notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Err(reason) }));
+            (channel, TraceEvent::TransmitFailed { tag, reason })
+        }
+        Event::Stopped { channel } => return notice(Notice::Stopped(channel)),
+        Event::Started { .. } | Event::TimeMark => return,
+    };
+    records.push(TraceRecord { time_ns: ticks as i64, channel: channel.number(), event });
+}

@@ -1,0 +1,453 @@
+//! A device: opening it, asking it, and the records it captures.
+//!
+//! [`Device::open`] connects, [`Device::records`] hands out what is captured, the other methods are requests.
+//! A thread of its own reads the port, so that a slow program loses nothing as long as the buffer lasts, and
+//! is told exactly what it lost after that.
+
+mod address;
+mod buffer;
+mod clock;
+mod error;
+mod intake;
+mod link;
+mod pipe;
+mod reader;
+#[cfg(feature = "serial")]
+mod serial;
+mod stamps;
+
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::sync::mpsc::{Receiver, Sender, sync_channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use cantap_wire::message::{ChannelConfig, Filter, Periodic, Registers, Status, Trigger, TxFrame};
+use cantap_wire::record::LossStage;
+use cantap_wire::{BitTiming, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
+
+pub use address::Address;
+pub use clock::{ClockMap, ClockReport, UtcClock};
+pub use error::DeviceError;
+pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
+pub use link::Link;
+pub use pipe::{PipeReader, PipeWriter, pipe};
+#[cfg(feature = "serial")]
+pub use serial::{Board, list};
+pub use stamps::{BitLengths, tighten};
+
+use crate::TraceRecord;
+use reader::{Answer, Order, Shared};
+
+/// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
+const BUFFER_RECORDS: usize = 1 << 20;
+/// A request is given up after this time.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
+/// `Hello` is tried so often, since a device may have half a line of somebody else's in its input.
+const HELLO_TRIES: u32 = 3;
+/// So long for each try.
+const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
+/// Round trips that set the clock at the start.
+const CLOCK_ROUNDS: u32 = 8;
+/// A closing channel is given up when nothing arrives for so long.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+/// Transmissions that a subscriber may leave waiting.
+const TRANSMISSIONS: usize = 65_536;
+
+/// A device in a session of ours.
+pub struct Device {
+    shared: Arc<Shared>,
+    orders: Sender<Order>,
+    hello: Hello,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Device {
+    /// Connects to the device at an address.
+    pub fn open(address: &Address) -> Result<Self, DeviceError> {
+        Self::over(connect(address)?, &address.to_string())
+    }
+
+    /// Talks to the device at the other end of a byte stream; `name` is what messages call it.
+    pub fn over(link: Link, name: &str) -> Result<Self, DeviceError> {
+        let Link { reader, writer, keep_alive } = link;
+        let shared = Arc::new(Shared::new(name, writer, BUFFER_RECORDS));
+        let (orders, received_orders) = std::sync::mpsc::channel();
+        let for_thread = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("cantap-reader".to_owned())
+            .spawn(move || {
+                reader::run(reader, &for_thread, &received_orders);
+                drop(keep_alive);
+            })
+            .map_err(DeviceError::Thread)?;
+        // Its end stops the thread, whatever happens from here on.
+        let mut device = Self { shared, orders, hello: no_hello(), thread: Some(thread) };
+        device.hello = device.shake_hands()?;
+        for _ in 0..CLOCK_ROUNDS {
+            device.time()?;
+        }
+        device.order(Order::SettleClock);
+        Ok(device)
+    }
+
+    fn shake_hands(&self) -> Result<Hello, DeviceError> {
+        for _ in 0..HELLO_TRIES {
+            // The zero ends whatever stands in the device's input, and chooses our language over slcan.
+            self.shared.write(&[0])?;
+            match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
+                Ok(Reply::Hello(hello)) => return Ok(hello),
+                Ok(_) => return Err(DeviceError::WrongReply),
+                Err(DeviceError::Timeout { .. }) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Err(DeviceError::NotCantap { address: self.shared.name.clone() })
+    }
+
+    /// What the device is.
+    pub const fn hello(&self) -> &Hello {
+        &self.hello
+    }
+
+    /// Its address, as it was opened.
+    pub fn name(&self) -> &str {
+        &self.shared.name
+    }
+
+    /// Sends any request and waits for its answer.
+    pub fn request(&self, command: Command) -> Result<Reply, DeviceError> {
+        self.request_within(command, REQUEST_TIMEOUT)
+    }
+
+    fn request_within(&self, command: Command, timeout: Duration) -> Result<Reply, DeviceError> {
+        if let Some(gone) = self.shared.gone() {
+            return Err(gone);
+        }
+        let (id, answers) = self.shared.ask(command)?;
+        match answers.recv_timeout(timeout) {
+            Ok(Answer::Response(response)) => response.result.map_err(|refusal| match refusal {
+                Refusal::Protocol { device } => DeviceError::Protocol { device },
+                refusal => DeviceError::Refused { refusal },
+            }),
+            Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
+            Err(_) => {
+                self.shared.forget(id);
+                Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))
+            }
+        }
+    }
+
+    fn order(&self, order: Order) {
+        // If the thread has ended, there is nothing left to order.
+        let _ = self.orders.send(order);
+    }
+
+    /// The bit timing for a bit rate on this device: the recommended sample point.
+    pub fn timing(&self, bitrate_bps: u32) -> Result<BitTiming, DeviceError> {
+        BitTiming::choose(self.hello.can_clock_hz, bitrate_bps, None)
+            .map_err(|reason| DeviceError::BitRate { bitrate_bps, reason })
+    }
+
+    /// Opens a channel; without a configuration, with the one saved on the device. Returns what was applied.
+    pub fn open_channel(
+        &self,
+        channel: Channel,
+        config: Option<ChannelConfig>,
+    ) -> Result<ChannelConfig, DeviceError> {
+        if channel.number() > self.hello.channels {
+            return Err(DeviceError::NoChannel { channel });
+        }
+        // Before the first frame can arrive.
+        if let Some(config) = &config {
+            self.set_bit_length(channel, config);
+        }
+        match self.request(Command::Open { channel, config })? {
+            Reply::Opened(applied) => {
+                self.set_bit_length(channel, &applied);
+                Ok(applied)
+            }
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    fn set_bit_length(&self, channel: Channel, config: &ChannelConfig) {
+        self.order(Order::BitLength {
+            channel,
+            clocks_per_bit: config.timing.clocks_per_bit(),
+            clock_hz: self.hello.can_clock_hz,
+            tick_hz: self.hello.tick_hz,
+        });
+    }
+
+    /// Opens a channel that only listens, at a bit rate.
+    pub fn listen(&self, channel: Channel, bitrate_bps: u32) -> Result<ChannelConfig, DeviceError> {
+        let timing = self.timing(bitrate_bps)?;
+        self.open_channel(channel, Some(ChannelConfig::listen_only(timing)))
+    }
+
+    /// Closes a channel and waits until everything it captured has arrived.
+    pub fn close_channel(&self, channel: Channel) -> Result<(), DeviceError> {
+        let before = self.shared.published();
+        let was_open = self.status()?.channels[channel.index()].open.is_some();
+        self.done(Command::Close { channel })?;
+        let mut seen = before;
+        let mut quiet = Instant::now();
+        while was_open && seen.stopped[channel.index()] == before.stopped[channel.index()] {
+            if let Some(gone) = self.shared.gone() {
+                return Err(gone);
+            }
+            let now = self.shared.wait_for_news(&seen, DRAIN_TIMEOUT / 4);
+            if now.reads != seen.reads {
+                quiet = Instant::now();
+            }
+            seen = now;
+            if quiet.elapsed() > DRAIN_TIMEOUT {
+                // The record itself was lost on the way; the device's counters tell the rest.
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    /// Closes both channels, waits for everything they captured, accounts for what the link lost at the very
+    /// end, and ends the stream of records. Returns the device's last status.
+    pub fn stop(&self) -> Result<Status, DeviceError> {
+        for channel in Channel::ALL {
+            self.close_channel(channel)?;
+        }
+        let status = self.status()?;
+        let counters = self.counters();
+        for channel in Channel::ALL {
+            let (device, ours) = (&status.channels[channel.index()], &counters.channels[channel.index()]);
+            // A lost batch may have held loss records, and after the last batch nothing tells what was in it.
+            let missing = |device: u32, ours: u64| device.wrapping_sub(ours as u32);
+            let on_the_link =
+                missing(device.frames.wrapping_sub(device.lost_queue), ours.received + ours.lost_link);
+            for (stage, count) in [
+                (LossStage::Controller, missing(device.lost_controller, ours.lost_controller)),
+                (LossStage::Queue, missing(device.lost_queue, ours.lost_queue)),
+                (LossStage::Link, on_the_link),
+            ] {
+                if count > 0 && count < u32::MAX / 2 {
+                    self.order(Order::Losses { channel, stage, count });
+                }
+            }
+        }
+        self.order(Order::Finish);
+        let deadline = Instant::now() + DRAIN_TIMEOUT;
+        while !self.shared.buffer.has_ended() && Instant::now() < deadline {
+            self.shared.wait_for_news(&self.shared.published(), Duration::from_millis(5));
+        }
+        Ok(status)
+    }
+
+    /// The records captured from now on. Two handles share the records between them.
+    pub fn records(&self) -> Records {
+        Records { shared: Arc::clone(&self.shared), batch: Vec::new().into_iter() }
+    }
+
+    /// How transmissions end, from now on. Replaces an earlier subscription.
+    pub fn transmissions(&self) -> Receiver<Transmission> {
+        let (sender, receiver) = sync_channel(TRANSMISSIONS);
+        self.shared.subscribe(sender);
+        receiver
+    }
+
+    /// What was received and lost so far.
+    pub fn counters(&self) -> Counters {
+        self.shared.published().counters
+    }
+
+    /// What is known about the device's clock.
+    pub fn clock(&self) -> ClockReport {
+        self.shared.published().clock.unwrap_or(ClockReport { drift_ppm: None, round_trip_ns: 0 })
+    }
+
+    /// The state of the device.
+    pub fn status(&self) -> Result<Status, DeviceError> {
+        match self.request(Command::Status)? {
+            Reply::Status(status) => Ok(status),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// The device's time, in ticks since it started.
+    pub fn time(&self) -> Result<u64, DeviceError> {
+        match self.request(Command::Time)? {
+            Reply::Time(ticks) => Ok(ticks),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Replaces all filters of a closed channel. Returns the hardware banks that it uses and could use.
+    pub fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<(u8, u8), DeviceError> {
+        let filters = heapless::Vec::from_slice(filters).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::SetFilters { channel, filters })? {
+            Reply::Filters { banks_used, banks_total } => Ok((banks_used, banks_total)),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Queues frames for transmission, all or none. Returns the places that are free after it.
+    pub fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<u16, DeviceError> {
+        let frames = heapless::Vec::from_slice(frames).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::Send { channel, frames })? {
+            Reply::Queued { free } => Ok(free),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Drops everything that is queued for transmission.
+    pub fn abort(&self, channel: Channel) -> Result<(), DeviceError> {
+        self.done(Command::Abort { channel })
+    }
+
+    /// Sets or clears a periodic transmission.
+    pub fn set_periodic(
+        &self,
+        channel: Channel,
+        slot: u8,
+        entry: Option<Periodic>,
+    ) -> Result<(), DeviceError> {
+        self.done(Command::SetPeriodic { channel, slot, entry })
+    }
+
+    /// Sets or clears a reply that is sent when a matching frame is received.
+    pub fn set_trigger(&self, channel: Channel, slot: u8, entry: Option<Trigger>) -> Result<(), DeviceError> {
+        self.done(Command::SetTrigger { channel, slot, entry })
+    }
+
+    /// The controller's registers.
+    pub fn registers(&self, channel: Channel) -> Result<Registers, DeviceError> {
+        match self.request(Command::Registers { channel })? {
+            Reply::Registers(registers) => Ok(registers),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Leaves bus-off where recovery is manual.
+    pub fn recover(&self, channel: Channel) -> Result<(), DeviceError> {
+        self.done(Command::Recover { channel })
+    }
+
+    /// Shows an LED pattern, to find the device among others.
+    pub fn identify(&self, seconds: u8) -> Result<(), DeviceError> {
+        self.done(Command::Identify { seconds })
+    }
+
+    /// Restarts the firmware. The port vanishes.
+    pub fn reset(&self) -> Result<(), DeviceError> {
+        self.done(Command::Reset)
+    }
+
+    /// Enters the chip's USB bootloader. The port vanishes.
+    pub fn bootloader(&self) -> Result<(), DeviceError> {
+        self.done(Command::Bootloader)
+    }
+
+    /// Stores both channels' configuration and filters on the device.
+    pub fn save_defaults(&self) -> Result<(), DeviceError> {
+        self.done(Command::SaveDefaults)
+    }
+
+    /// Erases what [`Self::save_defaults`] stored.
+    pub fn clear_defaults(&self) -> Result<(), DeviceError> {
+        self.done(Command::ClearDefaults)
+    }
+
+    fn done(&self, command: Command) -> Result<(), DeviceError> {
+        match self.request(command)? {
+            Reply::Done => Ok(()),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+}
+
+impl Drop for Device {
+    /// Leaves the bus. A device does that by itself when the port closes; telling it is quicker.
+    fn drop(&mut self) {
+        if !self.shared.buffer.has_ended() && self.shared.gone().is_none() && self.hello.channels > 0 {
+            for channel in Channel::ALL {
+                let _ = self.shared.ask(Command::Close { channel });
+            }
+        }
+        self.shared.quit.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // Joined so that the port is closed when the next one opens it.
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Stands in while there is no answer yet.
+fn no_hello() -> Hello {
+    Hello {
+        protocol: PROTOCOL_VERSION,
+        firmware: [0; 3],
+        board: heapless::String::new(),
+        serial: heapless::String::new(),
+        channels: 0,
+        tick_hz: 1,
+        can_clock_hz: 1,
+        queue_bytes: 0,
+        tx_queue: 0,
+        periodic_slots: 0,
+        trigger_slots: 0,
+        filter_banks: 0,
+        capabilities: 0,
+    }
+}
+
+/// Opens the byte stream behind an address.
+fn connect(address: &Address) -> Result<Link, DeviceError> {
+    match address {
+        #[cfg(feature = "serial")]
+        Address::Serial(port) => serial::open(port),
+        #[cfg(not(feature = "serial"))]
+        Address::Serial(_) => not_built(address, "serial"),
+        Address::Virtual(_) => not_built(address, "virtual"),
+        Address::Emulated(_) => not_built(address, "emu"),
+    }
+}
+
+fn not_built(address: &Address, feature: &'static str) -> Result<Link, DeviceError> {
+    Err(DeviceError::NotBuilt { address: address.to_string(), feature })
+}
+
+/// Captured records, in order. As an iterator it waits for the next one and ends after [`Device::stop`], or
+/// with an error when the device vanished, in both cases after everything received.
+pub struct Records {
+    shared: Arc<Shared>,
+    batch: std::vec::IntoIter<TraceRecord>,
+}
+
+impl Records {
+    /// The next records, in one piece: none if there are none within `timeout`, `None` after the last.
+    pub fn next_batch(&mut self, timeout: Duration) -> Result<Option<Vec<TraceRecord>>, DeviceError> {
+        let rest: Vec<TraceRecord> = std::mem::take(&mut self.batch).collect();
+        if rest.is_empty() { self.shared.buffer.pop(Some(timeout)) } else { Ok(Some(rest)) }
+    }
+
+    /// Takes back the memory of a batch. Not necessary, only quicker.
+    pub fn recycle(&self, batch: Vec<TraceRecord>) {
+        self.shared.buffer.recycle(batch);
+    }
+}
+
+impl Iterator for Records {
+    type Item = Result<TraceRecord, DeviceError>;
+
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            if let Some(record) = self.batch.next() {
+                return Some(Ok(record));
+            }
+            match self.shared.buffer.pop(None) {
+                Ok(Some(batch)) => self.batch = batch.into_iter(),
+                Ok(None) => return None,
+                Err(error) => return Some(Err(error)),
+            }
+        }
+    }
+}

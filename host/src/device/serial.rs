@@ -1,0 +1,64 @@
+//! Devices on serial ports.
+
+use std::time::Duration;
+
+use cantap_wire::{USB_PID, USB_VID};
+use serialport::{ErrorKind, SerialPortType};
+
+use super::{DeviceError, Link};
+
+/// A read returns at the latest after this time.
+const READ_TIMEOUT: Duration = Duration::from_millis(50);
+/// CDC-ACM has no line speed; the number only has to be valid.
+const NOMINAL_BAUD: u32 = 115_200;
+
+/// A serial port with a cantap board behind it, judged by its USB IDs.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Board {
+    /// The port's path or name.
+    pub port: String,
+    /// The board's serial number, if the system tells.
+    pub serial_number: Option<String>,
+    /// What the board calls itself, if the system tells.
+    pub product: Option<String>,
+}
+
+/// Finds connected boards by their USB IDs. Where the system tells no IDs, it finds none.
+pub fn list() -> Result<Vec<Board>, DeviceError> {
+    let ports = serialport::available_ports().map_err(|error| DeviceError::Open {
+        address: "serial ports".to_owned(),
+        reason: error.to_string(),
+    })?;
+    Ok(ports
+        .into_iter()
+        .filter_map(|port| match port.port_type {
+            SerialPortType::UsbPort(usb) if (usb.vid, usb.pid) == (USB_VID, USB_PID) => {
+                Some(Board { port: port.port_name, serial_number: usb.serial_number, product: usb.product })
+            }
+            _ => None,
+        })
+        .collect())
+}
+
+/// Opens a port for this program alone, in raw mode, and raises DTR.
+pub(super) fn open(port: &str) -> Result<Link, DeviceError> {
+    let open = serialport::new(port, NOMINAL_BAUD).timeout(READ_TIMEOUT).dtr_on_open(true).open();
+    let reader = open.map_err(|error| translate(port, &error))?;
+    let writer = reader.try_clone().map_err(|error| translate(port, &error))?;
+    Ok(Link { reader: Box::new(reader), writer: Box::new(writer), keep_alive: Box::new(()) })
+}
+
+fn translate(port: &str, error: &serialport::Error) -> DeviceError {
+    let address = port.to_owned();
+    let reason = error.to_string();
+    let busy = reason.contains("lock") || reason.contains("busy");
+    match error.kind {
+        _ if busy => DeviceError::Busy { address },
+        ErrorKind::Io(std::io::ErrorKind::PermissionDenied) if cfg!(windows) => DeviceError::Busy { address },
+        ErrorKind::Io(std::io::ErrorKind::PermissionDenied) => DeviceError::Forbidden { address },
+        ErrorKind::NoDevice | ErrorKind::Io(std::io::ErrorKind::NotFound) => {
+            DeviceError::NotFound { address }
+        }
+        _ => DeviceError::Open { address, reason },
+    }
+}

@@ -1,0 +1,95 @@
+//! Tightens late stamps.
+//!
+//! A device's stamp is never early, only late: by the interrupt's latency, or, for a frame found queued
+//! behind another, by up to a whole frame and flagged. But two frames never overlap: frame k ended no later
+//! than frame k+1 on the same channel minus that one's exact length.
+
+use cantap_wire::CHANNELS;
+
+use crate::bits::bits_on_bus;
+use crate::{TraceEvent, TraceRecord};
+
+/// A bit's length on each channel, while it is open.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct BitLengths {
+    /// In ticks, as a fixed-point number with [`FRACTION_BITS`] fractional bits; 0 while closed.
+    fixed: [u64; CHANNELS],
+}
+
+/// Fractional bits of a bit's length in ticks.
+const FRACTION_BITS: u32 = 20;
+
+impl BitLengths {
+    /// Sets a channel's bit rate: `clock_hz` of the controller over `clocks_per_bit`, in ticks of `tick_hz`.
+    pub fn set(&mut self, channel: usize, clocks_per_bit: u32, clock_hz: u32, tick_hz: u32) {
+        let scaled = (u128::from(clocks_per_bit) * u128::from(tick_hz)) << FRACTION_BITS;
+        self.fixed[channel] = (scaled / u128::from(clock_hz.max(1))) as u64;
+    }
+
+    /// Forgets a channel's bit rate: its stamps stay as they are.
+    pub fn clear(&mut self, channel: usize) {
+        self.fixed[channel] = 0;
+    }
+
+    #[inline]
+    fn ticks(&self, channel: usize, bits: u32) -> i64 {
+        ((self.fixed[channel] * u64::from(bits)) >> FRACTION_BITS) as i64
+    }
+}
+
+/// Tightens records in stream order whose `time_ns` still holds device ticks. What stands behind a loss
+/// bounds what stands before it all the more.
+pub fn tighten(records: &mut [TraceRecord], lengths: &BitLengths) {
+    let mut limit = [i64::MAX; CHANNELS];
+    for record in records.iter_mut().rev() {
+        let TraceEvent::Frame { frame, .. } = &record.event else { continue };
+        let channel = usize::from(record.channel == 2);
+        if lengths.fixed[channel] == 0 {
+            continue;
+        }
+        record.time_ns = record.time_ns.min(limit[channel]);
+        limit[channel] = record.time_ns - lengths.ticks(channel, bits_on_bus(frame));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Direction;
+
+    fn record(channel: u8, ticks: i64, late: bool) -> TraceRecord {
+        let frame = "000#55".parse().unwrap();
+        TraceRecord {
+            time_ns: ticks,
+            channel,
+            event: TraceEvent::Frame { frame, direction: Direction::Rx, late },
+        }
+    }
+
+    #[test]
+    fn frames_that_waited_in_the_fifo_move_back_by_exact_lengths() {
+        let mut lengths = BitLengths::default();
+        // 36 clocks of 36 MHz: 1 Mbit/s, 12 ticks of 12 MHz per bit; a frame is 58 bits, 696 ticks.
+        lengths.set(0, 36, 36_000_000, 12_000_000);
+        let mut records = vec![
+            record(1, 10_000, true),
+            record(2, 10_001, true),
+            record(1, 10_000, true),
+            record(1, 10_000, true),
+            record(1, 10_600, false),
+        ];
+        tighten(&mut records, &lengths);
+        let times: Vec<i64> = records.iter().map(|record| record.time_ns).collect();
+        // Channel 2 has no known bit rate and stays.
+        assert_eq!(times, [8512, 10_001, 9208, 9904, 10_600]);
+    }
+
+    #[test]
+    fn a_stamp_that_is_early_enough_stays() {
+        let mut lengths = BitLengths::default();
+        lengths.set(0, 36, 36_000_000, 12_000_000);
+        let mut records = vec![record(1, 1000, true), record(1, 9000, false)];
+        tighten(&mut records, &lengths);
+        assert_eq!(records[0].time_ns, 1000);
+    }
+}

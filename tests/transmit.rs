@@ -1,0 +1,307 @@
+//! Transmission: order, times, periods, replies, confirmations, on fakes.
+
+mod fakes;
+
+use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::transmit::TX_QUEUE;
+use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
+use cantap_wire::message::{
+    ChannelConfig, Checksum, DEVICE_TAG, Filter, FrameKind, Mode, Modifier, Periodic, TRIGGER_TAG, Trigger,
+    TxFrame,
+};
+use cantap_wire::record::{ErrorState, TransmitFailure};
+use cantap_wire::{Channel, Command, Event, Frame, Record, Refusal, Reply};
+use fakes::{Bench, SMALL_QUEUE, config, numbered};
+
+const CAN1: Channel = Channel::Can1;
+const CAN2: Channel = Channel::Can2;
+
+type Queue = RecordQueue<SMALL_QUEUE>;
+
+fn send<const N: usize>(bench: &mut Bench<'_, N>, numbers: std::ops::Range<u32>) -> Result<Reply, Refusal> {
+    let frames =
+        numbers.map(|number| TxFrame { tag: number, frame: numbered(number), at_ticks: None }).collect();
+    bench.ask(Command::Send { channel: CAN1, frames })
+}
+
+/// Tags of confirmations and failures, in order.
+fn outcomes<const N: usize>(bench: &Bench<'_, N>) -> Vec<(u32, Option<TransmitFailure>)> {
+    let outcome = |event| match event {
+        Event::Transmitted { tag, .. } => Some((tag, None)),
+        Event::TransmitFailed { tag, reason, .. } => Some((tag, Some(reason))),
+        _ => None,
+    };
+    bench.events().into_iter().filter_map(outcome).collect()
+}
+
+fn flush<const N: usize>(bench: &mut Bench<'_, N>) {
+    bench.millisecond();
+    bench.millisecond();
+}
+
+#[test]
+fn frames_leave_in_order_and_each_is_confirmed_with_its_time() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    for first in (0..40).step_by(8) {
+        send(&mut bench, first..first + 8).unwrap();
+    }
+    let mut expected = Vec::new();
+    for number in 0..40 {
+        bench.pass(111 * TICKS_PER_US);
+        expected.push((
+            u64::from(bench.board.clock.now.get()),
+            Record::Event(Event::Transmitted { channel: CAN1, tag: number, frame: numbered(number) }),
+        ));
+        assert_eq!(bench.send_one(CAN1), Some(numbered(number)));
+    }
+    flush(&mut bench);
+    assert_eq!(bench.records, expected);
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert_eq!((status.channels[0].transmitted, status.channels[0].tx_pending), (40, 0));
+}
+
+#[test]
+fn a_full_queue_pushes_back_and_takes_all_or_nothing() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let mut accepted = 0;
+    let free = loop {
+        match send(&mut bench, accepted..accepted + 7) {
+            Ok(Reply::Queued { .. }) => accepted += 7,
+            Err(Refusal::QueueFull { free }) => break free,
+            other => panic!("{other:?}"),
+        }
+    };
+    // Three wait in mailboxes.
+    assert_eq!(accepted as usize + free as usize, TX_QUEUE + 3);
+    for number in 0..accepted {
+        assert_eq!(bench.send_one(CAN1), Some(numbered(number)));
+    }
+    assert_eq!(bench.send_one(CAN1), None);
+}
+
+#[test]
+fn a_frame_waits_for_its_time_and_later_ones_wait_for_it() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let due = bench.board.clock.now.get() + 5 * TICKS_PER_MS;
+    let frames = [Some(u64::from(due)), None, Some(u64::from(due + 1000))]
+        .into_iter()
+        .enumerate()
+        .map(|(tag, at_ticks)| TxFrame { tag: tag as u32, frame: numbered(tag as u32), at_ticks })
+        .collect();
+    bench.ask(Command::Send { channel: CAN1, frames }).unwrap();
+    assert_eq!(bench.send_one(CAN1), None);
+    assert_eq!(bench.board.clock.alarm.get(), Some(due));
+    bench.board.clock.now.set(due - 1);
+    bench.alarm();
+    assert_eq!(bench.send_one(CAN1), None);
+    bench.board.clock.now.set(due);
+    bench.alarm();
+    assert_eq!(bench.send_one(CAN1), Some(numbered(0)));
+    assert_eq!(bench.send_one(CAN1), Some(numbered(1)));
+    assert_eq!(bench.send_one(CAN1), None);
+    assert_eq!(bench.board.clock.alarm.get(), Some(due + 1000));
+}
+
+#[test]
+fn a_target_time_of_more_than_a_day_is_refused() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let frames = [TxFrame { tag: 1, frame: numbered(1), at_ticks: Some(u64::MAX) }].into_iter().collect();
+    assert_eq!(bench.ask(Command::Send { channel: CAN1, frames }), Err(Refusal::TooFarAhead));
+}
+
+fn periodic(text: &str, period_ms: u32, count: u32, modifiers: &[Modifier]) -> Periodic {
+    Periodic {
+        frame: text.parse().unwrap(),
+        period_ticks: period_ms * TICKS_PER_MS,
+        count,
+        modifiers: modifiers.iter().copied().collect(),
+    }
+}
+
+#[test]
+fn a_periodic_frame_keeps_its_period_without_drift() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let entry = Some(periodic("100#", 10, 5, &[]));
+    bench.ask(Command::SetPeriodic { channel: CAN1, slot: 31, entry }).unwrap();
+    let mut sent = Vec::new();
+    let start = bench.board.clock.now.get();
+    for _ in 0..100_000 {
+        bench.pass(TICKS_PER_US);
+        bench.alarm();
+        if bench.send_one(CAN1).is_some() {
+            sent.push((bench.board.clock.now.get() - start) / TICKS_PER_US);
+        }
+    }
+    // The first leaves while the response is on its way, before the first look.
+    assert_eq!(sent, [1, 10_000, 20_000, 30_000, 40_000]);
+    flush(&mut bench);
+    assert_eq!(outcomes(&bench), vec![(DEVICE_TAG + 31, None); 5]);
+}
+
+#[test]
+fn modifiers_count_check_and_randomise() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let entry = periodic(
+        "100#F0000000",
+        1,
+        0,
+        &[
+            Modifier::Counter { byte: 0, low_bit: 2, bits: 2 },
+            Modifier::Random { byte: 1 },
+            Modifier::Checksum { byte: 3, algorithm: Checksum::Xor },
+        ],
+    );
+    bench.ask(Command::SetPeriodic { channel: CAN1, slot: 0, entry: Some(entry) }).unwrap();
+    let mut frames = Vec::new();
+    for _ in 0..40 {
+        bench.millisecond();
+        bench.alarm();
+        frames.extend(bench.send_one(CAN1));
+    }
+    let firsts: Vec<u8> = frames[..6].iter().map(|frame| frame.data()[0]).collect();
+    assert_eq!(firsts, [0xF0, 0xF4, 0xF8, 0xFC, 0xF0, 0xF4]);
+    assert!(frames.iter().all(|frame| frame.data().iter().fold(0, |sum, byte| sum ^ byte) == 0));
+    let random: std::collections::HashSet<u8> = frames.iter().map(|frame| frame.data()[1]).collect();
+    assert!(random.len() > 20, "{random:?}");
+}
+
+/// A bus that takes nothing must neither stop the count nor pile frames up.
+#[test]
+fn a_period_that_passes_unsent_is_told() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    send(&mut bench, 0..3).unwrap();
+    let entry = Some(periodic("100#", 10, 0, &[]));
+    bench.ask(Command::SetPeriodic { channel: CAN1, slot: 1, entry }).unwrap();
+    for _ in 0..35 {
+        bench.millisecond();
+        bench.alarm();
+    }
+    flush(&mut bench);
+    assert_eq!(outcomes(&bench), vec![(DEVICE_TAG + 1, Some(TransmitFailure::Overtaken)); 3]);
+    let sent: Vec<Frame> = std::iter::from_fn(|| bench.send_one(CAN1)).collect();
+    assert_eq!(sent.len(), 4);
+}
+
+#[test]
+fn entries_outside_frame_or_table_are_refused() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    for (slot, entry, refusal) in [
+        (32, periodic("100#", 10, 0, &[]), Refusal::BadSlot),
+        (0, periodic("100#", 0, 0, &[]), Refusal::BadEntry),
+        (0, periodic("100#11", 1, 0, &[Modifier::Random { byte: 1 }]), Refusal::BadEntry),
+        (
+            0,
+            periodic("100#11", 1, 0, &[Modifier::Counter { byte: 0, low_bit: 7, bits: 2 }]),
+            Refusal::BadEntry,
+        ),
+    ] {
+        assert_eq!(bench.ask(Command::SetPeriodic { channel: CAN1, slot, entry: Some(entry) }), Err(refusal));
+    }
+}
+
+#[test]
+fn a_matching_frame_is_answered_at_once_and_so_often() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let filter = Filter { extended: false, kind: FrameKind::Remote, id: 0x123, mask: 0x7FF };
+    let entry = Some(Trigger { filter, reply: numbered(9), count: 2 });
+    bench.ask(Command::SetTrigger { channel: CAN2, slot: 7, entry }).unwrap();
+    bench.receive(CAN2, "123#11".parse().unwrap());
+    assert_eq!(bench.send_one(CAN2), None);
+    for _ in 0..2 {
+        bench.receive(CAN2, "123#R".parse().unwrap());
+        assert_eq!(bench.send_one(CAN2), Some(numbered(9)));
+    }
+    bench.receive(CAN2, "123#R".parse().unwrap());
+    assert_eq!(bench.send_one(CAN2), None);
+    flush(&mut bench);
+    assert_eq!(outcomes(&bench), [(TRIGGER_TAG + 7, None); 2]);
+}
+
+#[test]
+fn an_abort_reports_every_frame_that_it_takes_back() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    send(&mut bench, 0..8).unwrap();
+    assert!(bench.send_one(CAN1).is_some());
+    bench.ask(Command::Abort { channel: CAN1 }).unwrap();
+    flush(&mut bench);
+    let mut outcomes = outcomes(&bench);
+    assert_eq!(outcomes.remove(0), (0, None));
+    outcomes.sort_by_key(|(tag, _)| *tag);
+    assert_eq!(outcomes, (1..8).map(|tag| (tag, Some(TransmitFailure::Aborted))).collect::<Vec<_>>());
+    send(&mut bench, 20..21).unwrap();
+    assert_eq!(bench.send_one(CAN1), Some(numbered(20)));
+}
+
+#[test]
+fn closing_reports_what_was_not_sent_before_the_stop() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    send(&mut bench, 0..8).unwrap();
+    bench.ask(Command::Close { channel: CAN1 }).unwrap();
+    flush(&mut bench);
+    let mut outcomes = outcomes(&bench);
+    outcomes.sort_by_key(|(tag, _)| *tag);
+    assert_eq!(outcomes, (0..8).map(|tag| (tag, Some(TransmitFailure::Closed))).collect::<Vec<_>>());
+    assert_eq!(bench.events().last(), Some(&Event::Stopped { channel: CAN1 }));
+}
+
+#[test]
+fn manual_recovery_gives_the_queue_up_and_waits_for_the_command() {
+    let queue = Queue::new();
+    let mut bench = Bench::new(&queue);
+    bench.greet();
+    let config = ChannelConfig { manual_recovery: true, ..config(Mode::Normal) };
+    bench.ask(Command::Open { channel: CAN1, config: Some(config) }).unwrap();
+    send(&mut bench, 0..5).unwrap();
+    bench.board.traffic[0].state = Some(ErrorState::BusOff);
+    flush(&mut bench);
+    flush(&mut bench);
+    let mut outcomes = outcomes(&bench);
+    outcomes.sort_by_key(|(tag, _)| *tag);
+    assert_eq!(outcomes, (0..5).map(|tag| (tag, Some(TransmitFailure::BusOff))).collect::<Vec<_>>());
+    bench.ask(Command::Recover { channel: CAN1 }).unwrap();
+    assert_eq!(bench.board.control[0].resumed, 1);
+    bench.board.traffic[0].state = None;
+    flush(&mut bench);
+    assert!(bench.events().contains(&Event::State {
+        channel: CAN1,
+        state: ErrorState::Active,
+        tec: 0,
+        rec: 0
+    }));
+}
+
+/// A confirmation is never lost: while the host reads nothing, transmission stops before it.
+#[test]
+fn confirmations_survive_a_host_that_does_not_read() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    for first in (0..200).step_by(8) {
+        send(&mut bench, first..first + 8).unwrap();
+    }
+    bench.port.takes = 0;
+    for number in 0..5000 {
+        bench.receive(CAN2, numbered(number));
+    }
+    for _ in 0..200 {
+        bench.send_one(CAN1);
+        bench.millisecond();
+    }
+    bench.port.takes = usize::MAX;
+    for _ in 0..300 {
+        bench.millisecond();
+        bench.send_one(CAN1);
+    }
+    flush(&mut bench);
+    assert_eq!(outcomes(&bench), (0..200).map(|tag| (tag, None)).collect::<Vec<_>>());
+}

@@ -1,6 +1,7 @@
 //! The bytes of every variant. A change here is a change of the protocol: it touches the version, the
 //! documentation and the changelog too.
 
+use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
 use cantap_wire::message::{
     ChannelConfig, ChannelStatus, Checksum, DeviceMessage, Filter, FrameKind, Mode, Modifier, Periodic,
@@ -43,7 +44,6 @@ fn received_frames() {
         let len = encode_received(&received, ticks, &mut out);
         hex(&out[..len])
     };
-    use Channel::{Can1, Can2};
     assert_eq!(record("555#", Can1, Stamp::Exact, false, 576), "80 55 05 80 09");
     assert_eq!(record("555#R2", Can2, Stamp::Exact, false, -1), "d2 55 05 01");
     assert_eq!(record("123#DEADBEEF", Can2, Stamp::Exact, false, 0), "c4 23 01 00 de ad be ef");

@@ -3,8 +3,14 @@
 
 pub mod bits;
 pub mod device;
+pub mod filter;
+#[cfg(feature = "formats")]
+pub mod formats;
+pub mod socketcan;
 #[cfg(feature = "stats")]
 pub mod stats;
+#[cfg(test)]
+mod testing;
 pub mod trace;
 
 pub use bits::{FrameBits, bits_on_bus};

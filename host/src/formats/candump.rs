@@ -1,0 +1,229 @@
+//! can-utils' log format, as `candump -l` writes it: `(1410714882.622188) can0 09F80102#36729A16`, with
+//! an optional ` R` or ` T` for the direction. Times have microseconds; error frames follow
+//! SocketCAN.
+
+use std::io;
+
+use cantap_wire::{Frame, Id};
+
+use super::input::Input;
+use super::interfaces::{self, Interfaces};
+use super::issue::{Fault, Place};
+use super::reader::{Decode, Found};
+use super::text::{self, NS_PER_S};
+use super::writer::{Encode, LeftOut};
+use crate::socketcan::{BUS_ERROR, ERROR_FLAG, ErrorFrame};
+use crate::{Direction, TraceEvent, TraceRecord};
+
+const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEEF'";
+
+/// Reads the format.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    interfaces: Interfaces,
+    /// A second event of the last line.
+    pending: Option<TraceRecord>,
+}
+
+impl Decode for Decoder {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(record) = self.pending.take() {
+            return Ok(Found::Record(record));
+        }
+        while let Some(line) = input.line()? {
+            let text = line.text.trim_ascii();
+            if matches!(text.first(), None | Some(b'#')) && !line.too_long {
+                continue;
+            }
+            return Ok(match self.parse(text) {
+                Ok((record, second)) => {
+                    self.pending = second.map(|event| TraceRecord { event, ..record });
+                    Found::Record(record)
+                }
+                Err(fault) => Found::Issue(Place::Line(line.number), fault),
+            });
+        }
+        Ok(Found::End)
+    }
+}
+
+impl Decoder {
+    /// One line's record, and a second event if it says two things.
+    #[inline]
+    fn parse(&mut self, line: &[u8]) -> Result<(TraceRecord, Option<TraceEvent>), Fault> {
+        let malformed = || Fault::malformed(EXPECTED, line);
+        let rest = line.strip_prefix(b"(").ok_or_else(malformed)?;
+        let (time, rest) = split_at_byte(rest, b')').ok_or_else(malformed)?;
+        let time_ns = text::time(time, NS_PER_S, b'.')
+            .ok_or_else(|| Fault::malformed("a time in seconds between the parentheses", time))?;
+        let (interface, rest) = text::word(rest);
+        let (frame, rest) = text::word(rest);
+        let (id, data) = split_at_byte(frame, b'#').ok_or_else(malformed)?;
+        let direction = match rest.trim_ascii() {
+            b"" | b"R" | b"r" => Direction::Rx,
+            b"T" | b"t" => Direction::Tx,
+            other => return Err(Fault::malformed("'R', 'T' or nothing behind the frame", other)),
+        };
+        let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
+        if data.first() == Some(&b'#') {
+            return Err(Fault::Unsupported("a CAN FD frame".into()));
+        }
+        let channel = self.interfaces.channel(interface);
+        if id.len() == 8 && raw & ERROR_FLAG != 0 {
+            let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
+            let (event, second) = ErrorFrame { classes: raw & (ERROR_FLAG - 1), data: bytes }.events();
+            return Ok((TraceRecord { time_ns, channel, event }, second));
+        }
+        let id = match id.len() {
+            3 => Id::standard(raw),
+            8 => Id::extended(raw),
+            _ => None,
+        };
+        let id = id.ok_or_else(|| {
+            Fault::malformed("an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF", frame)
+        })?;
+        let frame = payload(id, data)?;
+        let event = TraceEvent::Frame { frame, direction, late: false };
+        Ok((TraceRecord { time_ns, channel, event }, None))
+    }
+}
+
+/// What stands before and after the first `byte`.
+#[inline]
+fn split_at_byte(text: &[u8], byte: u8) -> Option<(&[u8], &[u8])> {
+    let at = text.iter().position(|&other| other == byte)?;
+    Some((&text[..at], &text[at + 1..]))
+}
+
+/// Up to eight bytes, with or without dots between them.
+#[inline]
+fn bytes(mut digits: &[u8]) -> Option<([u8; 8], u8)> {
+    let mut data = [0; 8];
+    let mut len = 0;
+    while let [high, low, rest @ ..] = digits {
+        *data.get_mut(len)? = text::hex_pair(*high, *low)?;
+        len += 1;
+        digits = match rest {
+            [b'.', more @ ..] if !more.is_empty() => more,
+            _ => rest,
+        };
+    }
+    digits.is_empty().then_some((data, len as u8))
+}
+
+/// What follows the `#`.
+#[inline]
+fn payload(id: Id, digits: &[u8]) -> Result<Frame, Fault> {
+    if let Some((data, len)) = bytes(digits) {
+        return Ok(Frame::from_bus(id, false, len, data));
+    }
+    // Remote frames and DLCs above 8 are rare: the frame's own text form understands them.
+    let text = format!("{id}#{}", String::from_utf8_lossy(digits));
+    text.parse().map_err(|error: cantap_wire::frame::ParseFrameError| {
+        Fault::malformed(format!("a frame such as 123#DEADBEEF ({error})"), text.as_bytes())
+    })
+}
+
+/// Writes the format.
+pub(crate) struct Encoder;
+
+impl Encode for Encoder {
+    #[inline]
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        out.push(b'(');
+        text::push_time(out, record.time_ns, NS_PER_S, 6, b'.');
+        out.extend_from_slice(b") can");
+        text::push_decimal(out, u64::from(interfaces::number(record.channel)));
+        out.push(b' ');
+        match &record.event {
+            TraceEvent::Frame { frame, direction, .. } => {
+                push_frame(out, frame);
+                if *direction == Direction::Tx {
+                    out.extend_from_slice(b" T");
+                }
+            }
+            event => {
+                // Every event but a frame has an error frame. python-can takes one without this class for
+                // a frame on the bus.
+                if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
+                    text::push_hex(out, ERROR_FLAG | BUS_ERROR | classes, 8);
+                    out.push(b'#');
+                    for byte in data {
+                        text::push_hex_byte(out, byte);
+                    }
+                }
+            }
+        }
+        out.push(b'\n');
+    }
+
+    fn finish(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
+}
+
+/// `123#DEADBEEF`.
+#[inline]
+fn push_frame(out: &mut Vec<u8>, frame: &Frame) {
+    let id = frame.id();
+    text::push_hex(out, id.raw(), if id.is_extended() { 8 } else { 3 });
+    out.push(b'#');
+    if frame.is_remote() {
+        out.push(b'R');
+        if frame.dlc() > 0 {
+            out.push(b'0' + frame.dlc().min(8));
+        }
+    }
+    for byte in frame.data() {
+        text::push_hex_byte(out, *byte);
+    }
+    if frame.dlc() > 8 {
+        out.push(b'_');
+        text::push_hex(out, u32::from(frame.dlc()), 1);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use crate::formats::Format;
+    use crate::testing::record;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_trace_round_trips(records in prop::collection::vec(record(1000), 0..20)) {
+            prop_assert_eq!(tests::round_trip(Format::Candump, &records), records);
+        }
+    }
+
+    #[test]
+    fn lines_are_what_candump_writes() {
+        let log = "(1410714882.622188) can0 09F80102#36729A16021AB80D\n\
+                   (0.000000) can1 123#R3\n\
+                   (1.000001) can0 123# T\n\
+                   (1.000001) can0 7FF#1122334455667788_F\n\
+                   (-0.500000) can0 000#00\n";
+        let (records, issues) = tests::read(Format::Candump, log);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(tests::write(Format::Candump, &records), log);
+    }
+
+    #[test]
+    fn broken_lines_are_named_and_the_rest_is_read() {
+        let log = "# a comment\n\n(1.0) can0 123#11\n(x) can0 123#11\nnonsense\n(2.0) can0 123##111\n\
+                   (2.0) can0 800#\n(2.0) can0 123#1\n(2.0) can0 123#11 Q\r\n(3.0) can0 123#5.6\n(4) can3 123#r";
+        let (records, issues) = tests::read(Format::Candump, log);
+        assert_eq!(records.len(), 2);
+        assert_eq!(
+            issues,
+            [
+                "test, line 4: expected a time in seconds between the parentheses, found 'x'",
+                "test, line 5: expected a log line such as '(1410714882.622188) can0 123#DEADBEEF', found 'nonsense'",
+                "test, line 6: a CAN FD frame cannot be represented and is left out",
+                "test, line 7: expected an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF, found '800#'",
+                "test, line 8: expected a frame such as 123#DEADBEEF (the data must be pairs of hexadecimal digits, with '.' between pairs if you like), found '123#1'",
+                "test, line 9: expected 'R', 'T' or nothing behind the frame, found 'Q'",
+                "test, line 10: expected a frame such as 123#DEADBEEF (the data must be pairs of hexadecimal digits, with '.' between pairs if you like), found '123#5.6'",
+            ]
+        );
+    }
+}

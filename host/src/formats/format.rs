@@ -1,0 +1,77 @@
+//! The formats by name, by suffix and by their first bytes.
+
+use std::fmt;
+use std::path::Path;
+use std::str::FromStr;
+
+/// A trace file format.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Format {
+    /// can-utils' log, as `candump -l` writes it.
+    Candump,
+}
+
+/// Names, suffixes and a description of each format. The first name is the one shown; the first
+/// format with a suffix is the one that the suffix picks.
+const FORMATS: &[(Format, &[&str], &[&str])] = &[(Format::Candump, &["candump", "log"], &["log", "txt"])];
+
+/// No such format.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum UnknownFormat {
+    /// Not a format's name.
+    #[error("'{0}' is no trace format; the formats are {known}", known = Format::names())]
+    Name(String),
+    /// A file's suffix says nothing.
+    #[error(
+        "the name '{0}' does not tell the format; name it with one of --format {known}",
+        known = Format::names()
+    )]
+    Suffix(String),
+}
+
+impl Format {
+    /// Every format.
+    pub fn all() -> impl Iterator<Item = Self> {
+        FORMATS.iter().map(|(format, ..)| *format)
+    }
+
+    /// The names of all formats, for messages.
+    pub fn names() -> String {
+        FORMATS.iter().map(|(_, names, _)| names[0]).collect::<Vec<_>>().join(", ")
+    }
+
+    /// By a path's suffix; `.gz` and `.zst` are looked through.
+    pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
+        let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
+        let bare = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+        bare.rsplit_once('.')
+            .and_then(|(_, suffix)| FORMATS.iter().find(|(_, _, suffixes)| suffixes.contains(&suffix)))
+            .map(|(format, ..)| *format)
+            .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
+    }
+
+    /// By a file's first bytes.
+    pub fn of_content(head: &[u8]) -> Option<Self> {
+        head.trim_ascii_start().starts_with(b"(").then_some(Self::Candump)
+    }
+}
+
+impl fmt::Display for Format {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let name = FORMATS.iter().find(|(format, ..)| format == self).map_or("", |(_, names, _)| names[0]);
+        f.write_str(name)
+    }
+}
+
+impl FromStr for Format {
+    type Err = UnknownFormat;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let lower = text.to_ascii_lowercase();
+        FORMATS
+            .iter()
+            .find(|(_, names, _)| names.contains(&lower.as_str()))
+            .map(|(format, ..)| *format)
+            .ok_or_else(|| UnknownFormat::Name(text.to_owned()))
+    }
+}

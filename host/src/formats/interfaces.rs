@@ -1,0 +1,68 @@
+//! Interface names (`can0`, `vcan1`, `OBD`) as channel numbers.
+
+/// Remembers which channel each interface name of a file stands for. `can0` is channel 1, as users
+/// count; a name that would take another's number, or has none, gets the next free one.
+#[derive(Default)]
+pub(crate) struct Interfaces {
+    known: Vec<(Vec<u8>, u8)>,
+    last: usize,
+}
+
+/// More names than this are noise, not channels; they share the last number.
+const MAX_NAMES: usize = 255;
+
+impl Interfaces {
+    /// The channel of a name.
+    #[inline]
+    pub(crate) fn channel(&mut self, name: &[u8]) -> u8 {
+        match self.known.get(self.last) {
+            Some((known, channel)) if known == name => *channel,
+            _ => self.search(name),
+        }
+    }
+
+    fn search(&mut self, name: &[u8]) -> u8 {
+        if let Some(at) = self.known.iter().position(|(known, _)| known == name) {
+            self.last = at;
+            return self.known[at].1;
+        }
+        if self.known.len() >= MAX_NAMES {
+            return u8::MAX;
+        }
+        let digits = name.iter().rev().take_while(|byte| byte.is_ascii_digit()).count();
+        let number = super::text::decimal(&name[name.len() - digits..]);
+        let wanted = number.and_then(|number| u8::try_from(number.saturating_add(1)).ok());
+        let taken = |channel: u8| self.known.iter().any(|(_, known)| *known == channel);
+        let channel = wanted
+            .filter(|channel| !taken(*channel))
+            .or_else(|| (1..=u8::MAX).find(|channel| !taken(*channel)))
+            .unwrap_or(u8::MAX);
+        self.last = self.known.len();
+        self.known.push((name.to_vec(), channel));
+        channel
+    }
+}
+
+/// The interface number of a channel: 0 for channel 1.
+pub(crate) fn number(channel: u8) -> u8 {
+    channel.saturating_sub(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_follow_the_names_and_never_collide() {
+        let mut interfaces = Interfaces::default();
+        for (name, channel) in
+            [("can0", 1), ("can1", 2), ("vcan1", 3), ("OBD", 4), ("can7", 8), ("can300", 5), ("can0", 1)]
+        {
+            assert_eq!(interfaces.channel(name.as_bytes()), channel, "{name}");
+        }
+        for extra in 0..1000 {
+            interfaces.channel(format!("x{extra}").as_bytes());
+        }
+        assert_eq!(interfaces.known.len(), MAX_NAMES);
+    }
+}

@@ -1,0 +1,29 @@
+//! Trace files: every format read and written as a stream, with memory that does not grow with the
+//! file.
+//!
+//! [`open_reader`] gives an iterator over records and issues; [`create_writer`] a [`TraceWriter`].
+//! The format follows the file's suffix, `.gz` and `.zst` are transparent, `-` is standard input
+//! or output. Each format is a file here, split into a decoder that takes bytes from an
+//! `Input` and an encoder that appends to a buffer; neither knows files, compression or rotation.
+
+mod candump;
+mod format;
+#[allow(dead_code, reason = "the formats that follow use the rest")]
+mod input;
+mod interfaces;
+mod issue;
+mod output;
+mod reader;
+mod rotate;
+#[cfg(test)]
+mod tests;
+#[allow(dead_code, reason = "the formats that follow use the rest")]
+mod text;
+#[allow(dead_code, reason = "the formats that follow use the rest")]
+mod writer;
+
+pub use format::{Format, UnknownFormat};
+pub use issue::{Fault, Place, ReadIssue};
+pub use reader::{OpenError, ReadOptions, TraceReader, open_reader};
+pub use rotate::{BadRotation, RotateAt, Rotation};
+pub use writer::{LeftOut, TraceWriter, WriteOptions, create_writer};

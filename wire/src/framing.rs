@@ -30,6 +30,13 @@ static CRC: Crc<u32, crc::Table<1>> = Crc::<u32, crc::Table<1>>::new(&crc::CRC_3
 #[cfg(not(target_os = "none"))]
 static CRC: Crc<u32, crc::Table<16>> = Crc::<u32, crc::Table<16>>::new(&crc::CRC_32_ISO_HDLC);
 
+/// The CRC of some bytes.
+pub fn checksum(bytes: impl Iterator<Item = u8>) -> u32 {
+    let mut digest = CRC.digest();
+    bytes.for_each(|byte| digest.update(&[byte]));
+    digest.finalize()
+}
+
 /// Why bytes between two zeros are not a message.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum FramingError {

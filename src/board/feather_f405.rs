@@ -1,0 +1,39 @@
+//! Adafruit Feather STM32F405 Express: STM32F405RGT6. Both channels need a transceiver (3.3 V) outside.
+//!
+//! Sources:
+//! - MicroPython `ports/stm32/boards/ADAFRUIT_F405_EXPRESS` (`mpconfigboard.h`, `pins.csv`): crystal 12 MHz, CAN1 on
+//!   D9/D10 (PB8/PB9), LED on PC1 lit by high, USB on PA11/PA12, SD_DETECT on PB12, SCK on PB13, the flash chip's
+//!   MOSI on PB5.
+//! - Zephyr 4.3 `boards/adafruit/feather_stm32f405`: the same crystal, LED and USB pins.
+//! - DS8626 Rev 9, table 9: CAN2 has PB5 or PB12 for RX, PB6 or PB13 for TX, all as AF9. Neither RX pin is on the
+//!   headers; PB12 goes to the card socket's detect switch, which is open without a card.
+
+use stm32f4xx_hal::gpio::{GpioExt, PinState};
+use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::rcc::Rcc;
+
+use super::{Connected, Led, Leds, Ports, UsbRegisters};
+
+/// Name of the board, as in `Hello`.
+pub const NAME: &str = "feather-f405";
+/// Crystal, in MHz.
+pub const HSE_MHZ: u32 = 12;
+
+/// Connects pins and peripherals.
+pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
+    let a = ports.a.split(rcc);
+    let b = ports.b.split(rcc);
+    let c = ports.c.split(rcc);
+
+    // The pull-ups make an input without a transceiver read recessive.
+    b.pb8.into_alternate::<9>().internal_pull_up(true);
+    b.pb9.into_alternate::<9>();
+    b.pb12.into_alternate::<9>().internal_pull_up(true);
+    b.pb13.into_alternate::<9>();
+
+    let led = c.pc1.into_push_pull_output_in_state(PinState::Low);
+    Connected {
+        usb: USB::new(usb, (a.pa11, a.pa12), &rcc.clocks),
+        leds: Leds::One(Led::new(led.erase(), PinState::High)),
+    }
+}

@@ -1,0 +1,45 @@
+//! Olimex STM32-P405: STM32F405RGT6 with a CAN transceiver (SN65HVD230) and a USB connector on board.
+//!
+//! Sources:
+//! - Zephyr 4.3 `boards/olimex/stm32_p405` (`olimex_stm32_p405.dts` and `doc/index.rst`): crystal 8 MHz, CAN1 on
+//!   PB8/PB9, LED on PC12, the pins of the GPIO row and of UEXT.
+//! - The printed circuit is the STM32-P103's, as the name of Olimex's schematic, `STM32-P103_P405_sch.pdf`, says.
+//!   ChibiOS `os/hal/boards/OLIMEX_STM32_P103/board.h`: PC10 is the transceiver's mode pin, PC11 low connects a
+//!   pull-up to the USB line, PB12 to PB15 go to the card socket.
+//! - Feaser LibMicroBLT `demos/ARMCM4_STM32F4_Olimex_STM32P405_CubeIDE/App/led.c`: PC12 low lights the LED. (Zephyr
+//!   and RIOT say high; this demonstration was made for the board and the P103's LED is lit by low, too.)
+//! - DS8626 Rev 9, table 9: AF9 is CAN1 on PB8/PB9 and CAN2 on PB5/PB6, AF10 is OTG_FS on PA11/PA12.
+
+use stm32f4xx_hal::gpio::{GpioExt, PinState};
+use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::rcc::Rcc;
+
+use super::{Connected, Led, Leds, Ports, UsbRegisters};
+
+/// Name of the board, as in `Hello`.
+pub const NAME: &str = "olimex-p405";
+/// Crystal, in MHz.
+pub const HSE_MHZ: u32 = 8;
+
+/// Connects pins and peripherals.
+pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
+    let a = ports.a.split(rcc);
+    let b = ports.b.split(rcc);
+    let c = ports.c.split(rcc);
+
+    // The pull-ups make an input without a transceiver read recessive.
+    b.pb8.into_alternate::<9>().internal_pull_up(true);
+    b.pb9.into_alternate::<9>();
+    b.pb5.into_alternate::<9>().internal_pull_up(true);
+    b.pb6.into_alternate::<9>();
+    // High-speed mode: full slew rate, and the receiver hears even in listen-only (SN65HVD230, Rs low).
+    c.pc10.into_push_pull_output_in_state(PinState::Low);
+    // The chip pulls the USB line up by itself.
+    c.pc11.into_push_pull_output_in_state(PinState::High);
+
+    let led = c.pc12.into_push_pull_output_in_state(PinState::High);
+    Connected {
+        usb: USB::new(usb, (a.pa11, a.pa12), &rcc.clocks),
+        leds: Leds::One(Led::new(led.erase(), PinState::Low)),
+    }
+}

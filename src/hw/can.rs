@@ -1,0 +1,381 @@
+//! The two bxCAN controllers (RM0090, "Controller area network"), each in two halves that share no register
+//! that both write: [`CanTraffic`] for the highest-priority interrupts, [`CanControl`] for commands.
+//! [`CanFilters`] are the banks, which lie in CAN1's registers for both.
+//!
+//! The `bxcan` crate is not used: its `enable` waits for the bus, it cannot lock the receive FIFO (so an
+//! overrun would overwrite the newest frame) and it hides which mailbox a confirmation belongs to.
+
+use core::ops::Deref;
+
+use cantap_firmware::filters::{BANKS, Layout, Shape};
+use cantap_firmware::ports::{Control, ErrorStatus, FilterBanks, Outcome, Traffic};
+use cantap_firmware::transmit::MAILBOXES;
+use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
+use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{CHANNELS, Frame, Id};
+use stm32f4xx_hal::pac::can1::RegisterBlock;
+use stm32f4xx_hal::pac::can1::rx::rir;
+use stm32f4xx_hal::pac::{CAN1, CAN2};
+use stm32f4xx_hal::rcc::{Enable, Rcc, Reset};
+
+/// After a frame is released from the FIFO, the next is there some APB1 clocks later. So many reads, of at
+/// least two such clocks each, are far more than that; the bound only keeps a defect from hanging an interrupt.
+const RELEASE_READS: u32 = 32;
+/// LEC's value that the hardware never writes: it shows whether there was an error since.
+const LEC_SEEN: u8 = 7;
+
+/// Both controllers' halves, and the filters.
+pub struct Controllers {
+    /// For the highest-priority interrupts.
+    pub traffic: [CanTraffic; CHANNELS],
+    /// For commands.
+    pub control: [CanControl; CHANNELS],
+    /// For commands.
+    pub filters: CanFilters,
+}
+
+impl Controllers {
+    /// Switches both controllers on; they are off the bus and let no frame pass.
+    pub fn new(_: CAN1, _: CAN2, rcc: &mut Rcc) -> Self {
+        CAN1::enable(rcc);
+        CAN2::enable(rcc);
+        CAN1::reset(rcc);
+        CAN2::reset(rcc);
+        let blocks = [Registers(CAN1::ptr()), Registers(CAN2::ptr())];
+        let mut control = blocks.map(|can| CanControl { can });
+        // After a reset a controller sleeps.
+        control.iter_mut().for_each(Control::stop);
+        Self {
+            traffic: blocks.map(CanTraffic::new),
+            control,
+            filters: CanFilters { can1: Registers(CAN1::ptr()) },
+        }
+    }
+}
+
+/// A controller's registers.
+#[derive(Clone, Copy)]
+struct Registers(*const RegisterBlock);
+
+// SAFETY: the registers are there for the whole program, wherever it touches them from. What the halves that hold
+// copies of the pointer write is disjoint, as their docs say.
+unsafe impl Send for Registers {}
+
+impl Deref for Registers {
+    type Target = RegisterBlock;
+
+    #[inline]
+    fn deref(&self) -> &RegisterBlock {
+        // SAFETY: the pointer is one of the PAC's, made from a peripheral that `Controllers::new` took.
+        unsafe { &*self.0 }
+    }
+}
+
+/// A controller's traffic half. It alone writes TSR, the mailboxes, RF0R, MSR and ESR.
+pub struct CanTraffic {
+    can: Registers,
+    /// Per mailbox: the number of the request in it.
+    requests: [u32; MAILBOXES],
+    next_request: u32,
+    /// Per mailbox: whether it was asked to be given up.
+    aborting: [bool; MAILBOXES],
+}
+
+impl CanTraffic {
+    const fn new(can: Registers) -> Self {
+        Self { can, requests: [0; MAILBOXES], next_request: 0, aborting: [false; MAILBOXES] }
+    }
+
+    /// The mailbox with the oldest request that has completed.
+    fn oldest_finished(&self) -> Option<usize> {
+        let tsr = self.can.tsr().read();
+        let completed = [tsr.rqcp0().bit(), tsr.rqcp1().bit(), tsr.rqcp2().bit()];
+        // Compared by distance, because the numbers wrap.
+        (0..MAILBOXES)
+            .filter(|&mailbox| completed[mailbox])
+            .max_by_key(|&mailbox| self.next_request.wrapping_sub(self.requests[mailbox]))
+    }
+}
+
+impl Traffic for CanTraffic {
+    #[inline]
+    fn pending(&self) -> u8 {
+        self.can.rf0r().read().fmp().bits()
+    }
+
+    #[inline]
+    fn receive(&mut self) -> Option<Frame> {
+        let fifo = self.can.rf0r();
+        // While a frame is being released, the mailbox still shows it.
+        let mut reads = RELEASE_READS;
+        while fifo.read().rfom().bit() && reads > 0 {
+            reads -= 1;
+        }
+        if fifo.read().fmp().bits() == 0 {
+            return None;
+        }
+        let mailbox = self.can.rx(0);
+        let rir = mailbox.rir().read();
+        let dlc = mailbox.rdtr().read().dlc().bits();
+        let low = mailbox.rdlr().read().bits();
+        let high = mailbox.rdhr().read().bits();
+        fifo.write(|w| w.rfom().release());
+
+        let data = (u64::from(high) << 32 | u64::from(low)).to_le_bytes();
+        Some(Frame::from_bus(received_id(&rir), rir.rtr().is_remote(), dlc, data))
+    }
+
+    #[inline]
+    fn take_overrun(&mut self) -> bool {
+        let overrun = self.can.rf0r().read().fovr().is_overrun();
+        if overrun {
+            self.can.rf0r().write(|w| w.fovr().clear());
+        }
+        overrun
+    }
+
+    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+        let tsr = self.can.tsr().read();
+        // A mailbox whose outcome nobody has taken yet is empty, but not free.
+        let free = [
+            tsr.tme0().bit() && tsr.rqcp0().bit_is_clear(),
+            tsr.tme1().bit() && tsr.rqcp1().bit_is_clear(),
+            tsr.tme2().bit() && tsr.rqcp2().bit_is_clear(),
+        ];
+        let number = free.iter().position(|&free| free)?;
+        let mailbox = self.can.tx(number);
+        let data = u64::from_le_bytes(frame.padded_data());
+        // Written whole: a stray TGT would replace the last data bytes.
+        mailbox.tdtr().write(|w| {
+            // SAFETY: a frame's DLC has four bits, as the field.
+            unsafe { w.dlc().bits(frame.dlc()) }
+        });
+        mailbox.tdlr().write(|w| {
+            // SAFETY: every value is data.
+            unsafe { w.bits(data as u32) }
+        });
+        mailbox.tdhr().write(|w| {
+            // SAFETY: every value is data.
+            unsafe { w.bits((data >> 32) as u32) }
+        });
+        mailbox.tir().write(|w| {
+            let id = frame.id();
+            if id.is_extended() {
+                // SAFETY: an extended identifier has 29 bits: 11 and 18, as the fields.
+                unsafe { w.stid().bits((id.raw() >> 18) as u16).exid().bits(id.raw() & 0x3_FFFF) };
+            } else {
+                // SAFETY: a standard identifier has 11 bits, as the field.
+                unsafe { w.stid().bits(id.raw() as u16) };
+            }
+            w.ide().bit(id.is_extended()).rtr().bit(frame.is_remote()).txrq().set_bit()
+        });
+        self.requests[number] = self.next_request;
+        self.next_request = self.next_request.wrapping_add(1);
+        self.aborting[number] = false;
+        Some(number as u8)
+    }
+
+    fn take_finished(&mut self) -> Option<(u8, Outcome)> {
+        let mailbox = self.oldest_finished()?;
+        let tsr = self.can.tsr().read();
+        let (sent, arbitration_lost) = match mailbox {
+            0 => (tsr.txok0().bit(), tsr.alst0().bit()),
+            1 => (tsr.txok1().bit(), tsr.alst1().bit()),
+            _ => (tsr.txok2().bit(), tsr.alst2().bit()),
+        };
+        let outcome = if sent {
+            Outcome::Sent
+        } else if self.aborting[mailbox] {
+            // Before the flags: they may be of an attempt before.
+            Outcome::Aborted
+        } else if arbitration_lost {
+            Outcome::ArbitrationLost
+        } else {
+            Outcome::Error
+        };
+        // Writing RQCP clears the mailbox's other flags, too.
+        self.can.tsr().write(|w| match mailbox {
+            0 => w.rqcp0().set_bit(),
+            1 => w.rqcp1().set_bit(),
+            _ => w.rqcp2().set_bit(),
+        });
+        Some((mailbox as u8, outcome))
+    }
+
+    fn abort(&mut self) {
+        let tsr = self.can.tsr().read();
+        let busy = [tsr.tme0().bit_is_clear(), tsr.tme1().bit_is_clear(), tsr.tme2().bit_is_clear()];
+        for (aborting, busy) in self.aborting.iter_mut().zip(busy) {
+            *aborting |= busy;
+        }
+        self.can.tsr().write(|w| w.abrq0().bit(busy[0]).abrq1().bit(busy[1]).abrq2().bit(busy[2]));
+    }
+
+    fn take_errors(&mut self) -> ErrorStatus {
+        // In this order an error that comes in between raises the interrupt again.
+        self.can.msr().write(|w| w.erri().set_bit());
+        let esr = self.can.esr().read();
+        let kind = match esr.lec().bits() {
+            1 => Some(BusErrorKind::Stuff),
+            2 => Some(BusErrorKind::Form),
+            3 => Some(BusErrorKind::Acknowledgment),
+            4 => Some(BusErrorKind::BitRecessive),
+            5 => Some(BusErrorKind::BitDominant),
+            6 => Some(BusErrorKind::Crc),
+            _ => None,
+        };
+        if kind.is_some() {
+            self.can.esr().write(|w| w.lec().set(LEC_SEEN));
+        }
+        let state = if esr.boff().bit() {
+            ErrorState::BusOff
+        } else if esr.epvf().bit() {
+            ErrorState::Passive
+        } else if esr.ewgf().bit() {
+            ErrorState::Warning
+        } else {
+            ErrorState::Active
+        };
+        ErrorStatus { kind, state, tec: esr.tec().bits(), rec: esr.rec().bits() }
+    }
+
+    fn registers(&self) -> RegisterSet {
+        RegisterSet {
+            mcr: self.can.mcr().read().bits(),
+            msr: self.can.msr().read().bits(),
+            tsr: self.can.tsr().read().bits(),
+            rf0r: self.can.rf0r().read().bits(),
+            ier: self.can.ier().read().bits(),
+            esr: self.can.esr().read().bits(),
+            btr: self.can.btr().read().bits(),
+        }
+    }
+}
+
+#[inline]
+fn received_id(rir: &rir::R) -> Id {
+    let standard = u32::from(rir.stid().bits());
+    if rir.ide().is_extended() {
+        Id::extended_truncated(standard << 18 | rir.exid().bits())
+    } else {
+        Id::standard_truncated(standard)
+    }
+}
+
+/// A controller's control half. It alone writes MCR, IER and BTR.
+pub struct CanControl {
+    can: Registers,
+}
+
+impl Control for CanControl {
+    fn stop(&mut self) {
+        self.can.mcr().modify(|_, w| w.sleep().clear_bit().inrq().set_bit());
+    }
+
+    fn halt(&mut self) {
+        // The controller's own reset: it sleeps then, and leaves the other one and the filters alone.
+        self.can.mcr().modify(|_, w| w.reset().set_bit());
+        self.stop();
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.can.msr().read().inak().bit()
+    }
+
+    fn start(&mut self, config: &ChannelConfig) {
+        let timing = &config.timing;
+        let silent = matches!(config.mode, Mode::ListenOnly | Mode::SilentLoopback);
+        let loopback = matches!(config.mode, Mode::Loopback | Mode::SilentLoopback);
+        self.can.btr().write(|w| {
+            // SAFETY: the timing is valid, so each value less one fits its field.
+            unsafe {
+                w.brp().bits(timing.prescaler - 1);
+                w.ts1().bits(timing.segment1 - 1);
+                w.ts2().bits(timing.segment2 - 1);
+                w.sjw().bits(timing.jump_width - 1);
+            }
+            w.silm().bit(silent).lbkm().bit(loopback)
+        });
+        self.can.mcr().modify(|_, w| {
+            // The stamps of time-triggered mode are not to be used (ES0182, "bxCAN").
+            w.ttcm().clear_bit();
+            w.abom().bit(!config.manual_recovery);
+            w.awum().clear_bit();
+            w.nart().bit(config.one_shot);
+            // A full FIFO keeps what it has.
+            w.rflm().set_bit();
+            // Mailboxes leave in the order of their requests.
+            w.txfp().set_bit()
+        });
+        self.can.ier().modify(|_, w| {
+            w.fmpie0().set_bit().fovie0().set_bit().tmeie().set_bit();
+            w.errie().set_bit().lecie().set_bit();
+            w.ewgie().set_bit().epvie().set_bit().bofie().set_bit()
+        });
+        self.resume();
+    }
+
+    fn resume(&mut self) {
+        self.can.mcr().modify(|_, w| w.inrq().clear_bit());
+    }
+}
+
+/// The acceptance filters of both controllers. They alone write FMR, FM1R, FS1R, FFA1R, FA1R and the banks.
+pub struct CanFilters {
+    can1: Registers,
+}
+
+impl FilterBanks for CanFilters {
+    fn write(&mut self, layout: &Layout) {
+        let can = &self.can1;
+        let bits = |is: fn(Shape) -> bool| {
+            let bit = |(number, bank): (usize, &Option<_>)| {
+                u32::from(bank.is_some_and(|bank: cantap_firmware::filters::Bank| is(bank.shape))) << number
+            };
+            layout.banks.iter().enumerate().map(bit).sum::<u32>()
+        };
+        let lists = bits(|shape| matches!(shape, Shape::List32 | Shape::List16));
+        let wide = bits(|shape| matches!(shape, Shape::List32 | Shape::Mask32));
+        let active = bits(|_| true);
+
+        // In initialisation mode neither controller receives, so it is entered only if it must be.
+        let reshaped = can.fmr().read().can2sb().bits() != layout.split
+            || can.fm1r().read().bits() != lists
+            || can.fs1r().read().bits() != wide
+            || can.fa1r().read().bits() != active;
+        if reshaped {
+            can.fmr().modify(|_, w| {
+                // SAFETY: a layout's split is at most 28, and the field has six bits.
+                unsafe { w.can2sb().bits(layout.split) };
+                w.finit().set_bit()
+            });
+            // SAFETY: one bit for each of the 28 banks, no others.
+            can.fm1r().write(|w| unsafe { w.bits(lists) });
+            // SAFETY: as above.
+            can.fs1r().write(|w| unsafe { w.bits(wide) });
+            // SAFETY: as above; all banks lead to FIFO 0.
+            can.ffa1r().write(|w| unsafe { w.bits(0) });
+        }
+        for (number, bank) in layout.banks.iter().enumerate().take(BANKS) {
+            let Some(bank) = bank else { continue };
+            let registers = can.fb(number);
+            if registers.fr1().read().bits() == bank.first && registers.fr2().read().bits() == bank.second {
+                continue;
+            }
+            // A bank can only be written while it is off.
+            // SAFETY: one bit for each of the 28 banks, no others.
+            can.fa1r().modify(|r, w| unsafe { w.bits(r.bits() & !(1 << number)) });
+            // SAFETY: every value is a filter.
+            registers.fr1().write(|w| unsafe { w.bits(bank.first) });
+            // SAFETY: every value is a filter.
+            registers.fr2().write(|w| unsafe { w.bits(bank.second) });
+            // SAFETY: one bit for each of the 28 banks, no others.
+            can.fa1r().modify(|r, w| unsafe { w.bits(r.bits() | 1 << number) });
+        }
+        if reshaped {
+            // SAFETY: one bit for each of the 28 banks, no others.
+            can.fa1r().write(|w| unsafe { w.bits(active) });
+            can.fmr().modify(|_, w| w.finit().clear_bit());
+        }
+    }
+}

@@ -1,0 +1,82 @@
+//! How one run of the firmware ends and what the next one learns of it.
+//!
+//! A word of RAM that startup does not touch outlives every reset but a loss of power.
+
+use core::mem::MaybeUninit;
+use core::panic::PanicInfo;
+use core::ptr::{addr_of, addr_of_mut};
+
+use cortex_m::peripheral::SCB;
+use cortex_m_rt::{ExceptionFrame, exception};
+use stm32f4xx_hal::pac;
+
+/// What the next run shall know. Arbitrary numbers that RAM is unlikely to hold by chance.
+const ENTER_BOOTLOADER: u32 = 0xB007_10AD;
+const FAILED: u32 = 0x0BAD_C0DE;
+
+/// The ROM bootloader's vector table (AN2606, "STM32F40xxx/41xxx", system memory).
+const SYSTEM_MEMORY: *const u32 = 0x1FFF_0000 as *const u32;
+/// SYSCFG_MEMRMP: system memory at address 0, where the bootloader looks for its vectors.
+const MAP_SYSTEM_MEMORY: u8 = 0b01;
+
+#[unsafe(link_section = ".uninit.cantap_restart")]
+static mut MESSAGE: MaybeUninit<u32> = MaybeUninit::uninit();
+
+fn leave(message: u32) {
+    // SAFETY: a plain word, written whole and volatile; nobody holds a reference to it.
+    unsafe { addr_of_mut!(MESSAGE).cast::<u32>().write_volatile(message) }
+}
+
+fn take() -> u32 {
+    // SAFETY: as in `leave`. Never initialised, but every value of a word is valid, and a volatile read takes
+    // what is there.
+    let message = unsafe { addr_of!(MESSAGE).cast::<u32>().read_volatile() };
+    leave(0);
+    message
+}
+
+/// Restarts the firmware.
+pub fn restart() -> ! {
+    SCB::sys_reset()
+}
+
+/// Restarts into the chip's ROM bootloader.
+pub fn restart_into_bootloader() -> ! {
+    leave(ENTER_BOOTLOADER);
+    SCB::sys_reset()
+}
+
+/// The first thing a run does, before any clock or peripheral is set up: enters the bootloader if the last run asked for
+/// it. Returns whether the last run failed: a panic, a fault, or the watchdog.
+pub fn begin(rcc: &pac::RCC, syscfg: &pac::SYSCFG) -> bool {
+    let message = take();
+    if message == ENTER_BOOTLOADER {
+        rcc.apb2enr().modify(|_, w| w.syscfgen().enabled());
+        // SAFETY: the field has two bits, and this is one of its values.
+        syscfg.memrmp().modify(|_, w| unsafe { w.mem_mode().bits(MAP_SYSTEM_MEMORY) });
+        // SAFETY: nothing but the clock gate above has been touched since reset, which is the state the bootloader
+        // expects; it needs interrupts, which startup has masked.
+        unsafe {
+            cortex_m::interrupt::enable();
+            cortex_m::asm::bootload(SYSTEM_MEMORY);
+        }
+    }
+    let bitten = rcc.csr().read().wdgrstf().is_reset();
+    rcc.csr().modify(|_, w| w.rmvf().clear());
+    message == FAILED || bitten
+}
+
+/// Leaves word and restarts: a device that restarts is there again in a second, one that stands still never.
+#[panic_handler]
+fn panic(_: &PanicInfo) -> ! {
+    leave(FAILED);
+    SCB::sys_reset()
+}
+
+/// As a panic.
+// SAFETY: touches a word of RAM that nobody refers to, and a register, then resets.
+#[exception]
+unsafe fn HardFault(_: &ExceptionFrame) -> ! {
+    leave(FAILED);
+    SCB::sys_reset()
+}

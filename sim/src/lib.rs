@@ -5,7 +5,10 @@
 //! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
 //! here looks at the host's clock, so the same seed gives the same run, byte for byte.
 
+pub mod otg;
 pub mod peripheral;
+pub mod usb;
+pub mod usb_host;
 
 pub use peripheral::Peripheral;
 

@@ -1,0 +1,127 @@
+//! One endpoint's registers, with the side effects that writing them has.
+
+use super::registers::{epctl, epint, eptsiz};
+
+/// An IN or OUT endpoint. Which of the two it is decides only the OTG core.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Endpoint {
+    /// DIEPCTLx or DOEPCTLx.
+    pub control: u32,
+    /// DIEPINTx or DOEPINTx, without TXFE, which follows the FIFO.
+    pub interrupt: u32,
+    /// DIEPTSIZx or DOEPTSIZx.
+    pub size: u32,
+}
+
+impl Endpoint {
+    /// Endpoint 0 out of reset: always active, answers NAK.
+    pub const fn control_pipe() -> Self {
+        Self { control: epctl::USBAEP, interrupt: 0, size: 0 }
+    }
+
+    /// Bytes of the largest packet. Endpoint 0 has a code in place of the number.
+    pub fn max_packet(&self, number: usize) -> usize {
+        let field = self.control & epctl::MPSIZ;
+        if number == 0 { 64 >> (field & 3) } else { field as usize }
+    }
+
+    /// Whether a transfer is armed.
+    pub fn enabled(&self) -> bool {
+        self.control & epctl::EPENA != 0
+    }
+
+    /// Whether the endpoint exists for the host.
+    pub fn active(&self) -> bool {
+        self.control & epctl::USBAEP != 0
+    }
+
+    /// Whether tokens are answered with STALL.
+    pub fn stalled(&self) -> bool {
+        self.control & epctl::STALL != 0
+    }
+
+    /// Whether tokens are answered with NAK.
+    pub fn naks(&self) -> bool {
+        self.control & epctl::NAKSTS != 0
+    }
+
+    /// The data toggle: DATA1 if set.
+    pub fn toggle(&self) -> bool {
+        self.control & epctl::DPID != 0
+    }
+
+    /// Sets the data toggle.
+    pub fn set_toggle(&mut self, data1: bool) {
+        self.control = self.control & !epctl::DPID | if data1 { epctl::DPID } else { 0 };
+    }
+
+    /// Bytes left in the transfer.
+    pub fn transfer_left(&self) -> usize {
+        (self.size & eptsiz::XFRSIZ) as usize
+    }
+
+    /// Packets left in the transfer.
+    pub fn packets_left(&self) -> u32 {
+        (self.size & eptsiz::PKTCNT) >> eptsiz::PKTCNT_SHIFT
+    }
+
+    /// Takes a packet of `bytes` bytes off the transfer.
+    pub fn count_packet(&mut self, bytes: usize) {
+        let left = self.transfer_left().saturating_sub(bytes) as u32;
+        let packets = self.packets_left().saturating_sub(1);
+        self.size = self.size & !(eptsiz::XFRSIZ | eptsiz::PKTCNT) | left | packets << eptsiz::PKTCNT_SHIFT;
+    }
+
+    /// Ends the transfer: disabled, answers NAK. The interrupt flag is the caller's business.
+    pub fn finish(&mut self) {
+        self.control = self.control & !epctl::EPENA | epctl::NAKSTS;
+    }
+
+    /// A write to the control register.
+    ///
+    /// EPENA can only be set by software and EPDIS only be requested; writing zeros to them changes
+    /// nothing. That is what makes a transfer survive a driver that writes the register whole.
+    pub fn write_control(&mut self, number: usize, value: u32) {
+        let mut stored = epctl::EPTYP | epctl::SNPM | epctl::STALL | epctl::TXFNUM | epctl::MPSIZ;
+        if number == 0 {
+            // Endpoint 0 is always active and a control endpoint, and its STALL is cleared by the next
+            // SETUP only.
+            stored &= !epctl::EPTYP;
+            let stall = self.control & epctl::STALL;
+            self.control = self.control & !stored | value & stored | stall;
+        } else {
+            stored |= epctl::USBAEP;
+            self.control = self.control & !stored | value & stored;
+            if value & epctl::SD0PID != 0 {
+                self.set_toggle(false);
+            }
+            if value & epctl::SODDFRM != 0 {
+                self.set_toggle(true);
+            }
+        }
+        if value & epctl::CNAK != 0 {
+            self.control &= !epctl::NAKSTS;
+        }
+        if value & epctl::SNAK != 0 {
+            self.control |= epctl::NAKSTS;
+            self.interrupt |= epint::INEPNE;
+        }
+        if value & epctl::EPENA != 0 {
+            self.control |= epctl::EPENA;
+        }
+        // Only where a transfer is armed; on endpoint 0 OUT it cannot be disabled, which the core
+        // checks before it calls.
+        if value & epctl::EPDIS != 0 && self.enabled() {
+            self.control &= !epctl::EPENA;
+            self.interrupt |= epint::EPDISD;
+        }
+    }
+
+    /// What a USB reset does to the endpoint: it is not active any more (endpoint 0 stays). A transfer
+    /// that was armed stays armed, until software disables it.
+    pub fn bus_reset(&mut self, number: usize) {
+        if number != 0 {
+            self.control &= !epctl::USBAEP;
+        }
+    }
+}

@@ -1,0 +1,206 @@
+//! The cable's end of OTG_FS: what a host's tokens, resets and silences do to it.
+
+use super::registers::{dcfg, dctl, epctl, epint, gint, pktsts};
+use super::{ENDPOINTS, Endpoint, Otg};
+
+/// The device's answer to an IN token.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum InReply {
+    /// Nothing: wrong address, endpoint not active, device not there.
+    Silence,
+    /// Not now.
+    Nak,
+    /// The endpoint is halted, or the request is not supported.
+    Stall,
+    /// A packet.
+    Data {
+        /// DATA1 rather than DATA0.
+        data1: bool,
+        /// Its bytes.
+        bytes: Vec<u8>,
+    },
+}
+
+/// The device's answer to an OUT or SETUP packet.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum OutReply {
+    /// Nothing: wrong address, endpoint not active, no room for a SETUP.
+    Silence,
+    /// Not now.
+    Nak,
+    /// The endpoint is halted, or the request is not supported.
+    Stall,
+    /// Taken, or a repetition that was taken before.
+    Ack,
+}
+
+/// Words that the receive FIFO keeps free for SETUP packets while it takes OUT data: two packets of
+/// two data words with their two status words each.
+const SETUP_RESERVE_WORDS: usize = 8;
+
+impl Otg {
+    /// The host begins to drive a reset.
+    ///
+    /// The core raises USBRST and takes the endpoints out of use. It disables no transfer, flushes no FIFO
+    /// and keeps the device address: that is the driver's business (RM0090, "Endpoint initialization on
+    /// USB reset").
+    pub fn bus_reset(&mut self) {
+        self.suspended = false;
+        self.in_control_transfer = false;
+        for number in 0..ENDPOINTS {
+            self.ins[number].bus_reset(number);
+            self.outs[number].bus_reset(number);
+        }
+        self.raise(gint::USBRST);
+    }
+
+    /// The host ends the reset, and the speed is known.
+    pub fn enumeration_done(&mut self) {
+        self.raise(gint::ENUMDNE);
+    }
+
+    /// Start of frame `number`.
+    pub fn start_of_frame(&mut self, number: u32) {
+        self.frame = number & 0x3FFF;
+        self.raise(gint::EOPF | gint::SOF);
+    }
+
+    /// The bus has been silent for 3 ms. Nothing if the device is suspended already.
+    pub fn bus_idle(&mut self) {
+        if !self.suspended {
+            self.suspended = true;
+            self.raise(gint::ESUSP | gint::USBSUSP);
+        }
+    }
+
+    /// The host signals resume.
+    pub fn resume(&mut self) {
+        if self.suspended {
+            self.suspended = false;
+            self.raise(gint::WKUPINT);
+        }
+    }
+
+    /// Whether the device has seen 3 ms of silence.
+    pub fn suspended(&self) -> bool {
+        self.suspended
+    }
+
+    fn raise(&mut self, flags: u32) {
+        self.interrupts |= flags;
+        self.update();
+    }
+
+    fn addressed(&self, address: u8) -> bool {
+        self.address == address
+    }
+
+    /// DCFG was written. An address that comes in mid-transfer is that of SET_ADDRESS and counts from
+    /// the end of the transfer's status stage on, which drivers rely on.
+    pub(super) fn take_address(&mut self) {
+        if !self.in_control_transfer {
+            self.address = ((self.dcfg & dcfg::DAD) >> dcfg::DAD_SHIFT) as u8;
+        }
+    }
+
+    /// A SETUP packet. The device must take it whatever its endpoint 0 is doing, unless the receive
+    /// FIFO is full.
+    pub fn setup(&mut self, address: u8, packet: [u8; 8]) -> OutReply {
+        if !self.addressed(address) || self.rx.len() + 4 > self.rx_size as usize {
+            return OutReply::Silence;
+        }
+        for endpoint in [&mut self.ins[0], &mut self.outs[0]] {
+            endpoint.control = endpoint.control & !epctl::STALL | epctl::NAKSTS;
+            // The data and status stages begin with DATA1.
+            endpoint.set_toggle(true);
+        }
+        self.outs[0].control &= !epctl::EPENA;
+        // A request without a data stage, or one that carries data out, ends with an IN packet.
+        self.in_control_transfer = packet[0] & 0x80 == 0;
+        self.rx.push(0, pktsts::SETUP_DATA, false, &packet);
+        self.rx.push(0, pktsts::SETUP_COMPLETE, false, &[]);
+        self.update();
+        OutReply::Ack
+    }
+
+    /// An OUT packet.
+    pub fn out(&mut self, address: u8, endpoint: u8, data1: bool, bytes: &[u8]) -> OutReply {
+        let number = usize::from(endpoint);
+        if !self.addressed(address) || number >= ENDPOINTS || !self.outs[number].active() {
+            return OutReply::Silence;
+        }
+        let room = self.rx.len() + bytes.len().div_ceil(4) + 2 + SETUP_RESERVE_WORDS <= self.rx_size as usize;
+        let held_off = self.dctl & dctl::GONSTS != 0;
+        let out = &mut self.outs[number];
+        if out.stalled() {
+            return OutReply::Stall;
+        }
+        if !out.enabled() || out.naks() || held_off || !room {
+            if !out.enabled() {
+                out.interrupt |= epint::TOKEN_UNSERVED;
+                self.update();
+            }
+            return OutReply::Nak;
+        }
+        if data1 != out.toggle() {
+            // The host did not see our ACK and repeats: acknowledged and thrown away.
+            return OutReply::Ack;
+        }
+        out.set_toggle(!data1);
+        // Drivers differ in whether they program a transfer size; without one, a packet is a transfer.
+        out.count_packet(bytes.len());
+        let complete = out.packets_left() == 0 || bytes.len() < out.max_packet(number);
+        if complete {
+            out.finish();
+        }
+        self.rx.push(endpoint, pktsts::OUT_DATA, data1, bytes);
+        if complete {
+            self.rx.push(endpoint, pktsts::OUT_COMPLETE, data1, &[]);
+        }
+        self.update();
+        OutReply::Ack
+    }
+
+    /// An IN token. With `acknowledged`, the host receives the packet and says so; without, the packet
+    /// or the host's ACK is lost on the cable and the device will send it again.
+    pub fn in_token(&mut self, address: u8, endpoint: u8, acknowledged: bool) -> InReply {
+        let number = usize::from(endpoint);
+        if !self.addressed(address) || number >= ENDPOINTS || !self.ins[number].active() {
+            return InReply::Silence;
+        }
+        let fifo = self.fifo_of(number);
+        let held_off = self.dctl & dctl::GINSTS != 0;
+        let input = &mut self.ins[number];
+        if input.stalled() {
+            return InReply::Stall;
+        }
+        let bytes = input.transfer_left().min(input.max_packet(number));
+        let ready = input.enabled() && !input.naks() && !held_off && input.packets_left() > 0;
+        if !ready || !self.txs[fifo].holds(bytes) {
+            input.interrupt |= epint::TOKEN_UNSERVED;
+            self.update();
+            return InReply::Nak;
+        }
+        let reply = InReply::Data { data1: input.toggle(), bytes: self.txs[fifo].front(bytes) };
+        if acknowledged {
+            self.txs[fifo].consume(bytes);
+            sent(input, bytes);
+            if number == 0 && bytes == 0 {
+                self.in_control_transfer = false;
+                self.take_address();
+            }
+            self.update();
+        }
+        reply
+    }
+}
+
+/// A packet of the transfer is through.
+fn sent(input: &mut Endpoint, bytes: usize) {
+    input.set_toggle(!input.toggle());
+    input.count_packet(bytes);
+    if input.packets_left() == 0 {
+        input.finish();
+        input.interrupt |= epint::XFRC;
+    }
+}

@@ -1,0 +1,63 @@
+//! The board's USB port with a host at the other end of the cable: what the machine sees as one
+//! peripheral.
+
+use crate::Peripheral;
+use crate::otg::Otg;
+use crate::usb_host::{Timing, UsbHost};
+
+/// OTG_FS and the host that it is connected to.
+#[derive(Debug)]
+pub struct UsbPort {
+    otg: Otg,
+    host: UsbHost,
+}
+
+impl UsbPort {
+    /// A port whose cable is out.
+    pub fn new(timing: Timing) -> Self {
+        Self { otg: Otg::new(), host: UsbHost::new(timing) }
+    }
+
+    /// The host, brought up to `now`, with the controller that some of its actions need.
+    pub fn host(&mut self, now: u64) -> (&mut UsbHost, &mut Otg) {
+        self.host.advance(&mut self.otg, now);
+        (&mut self.host, &mut self.otg)
+    }
+
+    /// The controller.
+    pub fn otg(&self) -> &Otg {
+        &self.otg
+    }
+}
+
+impl Peripheral for UsbPort {
+    fn read(&mut self, offset: u32, size: u8, now: u64) -> u32 {
+        self.host.advance(&mut self.otg, now);
+        let word = self.otg.read(offset & !3);
+        if size == 4 { word } else { word >> (8 * (offset & 3)) & ((1 << (8 * size)) - 1) }
+    }
+
+    fn write(&mut self, offset: u32, _size: u8, value: u32, now: u64) {
+        // The core's bus interface takes whole words only (RM0090, "CSR memory map"); drivers know.
+        self.host.advance(&mut self.otg, now);
+        self.otg.write(offset & !3, value);
+    }
+
+    fn irq(&self) -> bool {
+        self.otg.irq()
+    }
+
+    fn next_event(&self) -> Option<u64> {
+        self.host.next_event(&self.otg)
+    }
+
+    fn advance(&mut self, now: u64) {
+        self.host.advance(&mut self.otg, now);
+    }
+
+    fn reset(&mut self, now: u64) {
+        // The pull-up goes with the registers; the host notices at its next frame.
+        self.host.advance(&mut self.otg, now);
+        self.otg = Otg::new();
+    }
+}

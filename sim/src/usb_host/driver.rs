@@ -1,0 +1,536 @@
+//! What the operating system does with a device: enumerates it in the order that Linux does
+//! (a look at 64 bytes, a second reset, the address, descriptors, strings), then drives it as a CDC-ACM
+//! serial port. It only chooses transactions and judges answers; the bus is `mod.rs`'s.
+
+use std::collections::VecDeque;
+
+use super::control::{Outcome, Request, Step, Transfer};
+use super::descriptors::{self, CdcAcm, Device};
+use super::{Counters, EnumerationError};
+use crate::otg::{InReply, OutReply};
+
+const GET_DESCRIPTOR: u8 = 6;
+const SET_ADDRESS: u8 = 5;
+const SET_CONFIGURATION: u8 = 9;
+const SET_LINE_CODING: u8 = 0x20;
+const GET_LINE_CODING: u8 = 0x21;
+const SET_CONTROL_LINE_STATE: u8 = 0x22;
+/// bmRequestType: standard requests to the device, class requests to an interface.
+const FROM_DEVICE: u8 = 0x80;
+const TO_DEVICE: u8 = 0x00;
+const CLASS_IN: u8 = 0xA1;
+const CLASS_OUT: u8 = 0x21;
+
+/// Milliseconds that a device has to take its address (USB 2.0, 9.2.6.3: 2 ms; Linux waits 10).
+const ADDRESS_PAUSE_MS: u64 = 10;
+/// Bytes that the driver keeps for an application that does not read; then it stops asking.
+const INPUT_LIMIT: usize = 64 * 1024;
+
+/// The line coding that the driver sets: 115200 8N1, which the device only has to remember.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct LineCoding(pub [u8; 7]);
+
+impl Default for LineCoding {
+    fn default() -> Self {
+        let [a, b, c, d] = 115_200_u32.to_le_bytes();
+        Self([a, b, c, d, 0, 0, 8])
+    }
+}
+
+/// What a device said of itself.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Identity {
+    /// The device descriptor.
+    pub device: Device,
+    /// The CDC-ACM function.
+    pub acm: CdcAcm,
+    /// Manufacturer, product and serial number.
+    pub strings: [String; 3],
+}
+
+/// What the driver wants on the bus.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(super) enum Token {
+    Setup([u8; 8]),
+    In { endpoint: u8, bulk: bool },
+    Out { endpoint: u8, data1: bool, bytes: Vec<u8> },
+}
+
+/// What a control transfer is for; enumeration goes through them in this order.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Purpose {
+    FirstLook,
+    Address,
+    DeviceDescriptor,
+    Qualifier,
+    ObjectStore,
+    ConfigurationHead,
+    Configuration,
+    Languages,
+    Text(usize),
+    Configure,
+    PutCoding,
+    GetCoding,
+    Lines,
+    User,
+}
+
+impl Purpose {
+    fn name(self) -> &'static str {
+        match self {
+            Self::FirstLook => "the first GET_DESCRIPTOR(device)",
+            Self::Address => "SET_ADDRESS",
+            Self::DeviceDescriptor => "GET_DESCRIPTOR(device)",
+            Self::Qualifier => "GET_DESCRIPTOR(device qualifier)",
+            Self::ObjectStore => "GET_DESCRIPTOR(BOS)",
+            Self::ConfigurationHead | Self::Configuration => "GET_DESCRIPTOR(configuration)",
+            Self::Languages | Self::Text(_) => "GET_DESCRIPTOR(string)",
+            Self::Configure => "SET_CONFIGURATION",
+            Self::PutCoding => "SET_LINE_CODING",
+            Self::GetCoding => "GET_LINE_CODING",
+            Self::Lines => "SET_CONTROL_LINE_STATE",
+            Self::User => "a test's request",
+        }
+    }
+}
+
+#[derive(Debug)]
+struct Pending {
+    purpose: Purpose,
+    transfer: Transfer,
+    started: Option<u64>,
+}
+
+/// The driver's state.
+#[derive(Debug)]
+pub(super) struct Driver {
+    address: u8,
+    last_address: u8,
+    ep0_packet: usize,
+    resets: u32,
+    pending: Option<Pending>,
+    device: Option<Device>,
+    configuration_length: u16,
+    usb_version: u16,
+    acm: Option<CdcAcm>,
+    language: u16,
+    strings: [String; 3],
+    configured: bool,
+    identity: Option<Identity>,
+    failure: Option<EnumerationError>,
+    reset_request: bool,
+    pause: Option<u64>,
+    port_wanted: bool,
+    /// What the request on its way says of DTR.
+    lines_sent: bool,
+    coding_set: bool,
+    port_open: bool,
+    in_data1: bool,
+    out_data1: bool,
+    notify_data1: bool,
+    notify_in: u32,
+    /// Pipes that said NAK in this round: control, bulk IN, bulk OUT.
+    deferred: [bool; 3],
+    out_turn: bool,
+    partial: Vec<u8>,
+    user: VecDeque<Request>,
+    pub(super) input: Vec<u8>,
+    pub(super) output: VecDeque<u8>,
+    pub(super) reading: bool,
+    pub(super) outcomes: VecDeque<Outcome>,
+    pub(super) enumerations: u64,
+}
+
+impl Driver {
+    pub(super) fn new() -> Self {
+        Self {
+            address: 0,
+            last_address: 0,
+            ep0_packet: 64,
+            resets: 0,
+            pending: None,
+            device: None,
+            configuration_length: 0,
+            usb_version: 0,
+            acm: None,
+            language: 0,
+            strings: Default::default(),
+            configured: false,
+            identity: None,
+            failure: None,
+            reset_request: false,
+            pause: None,
+            port_wanted: false,
+            lines_sent: false,
+            coding_set: false,
+            port_open: false,
+            in_data1: false,
+            out_data1: false,
+            notify_data1: false,
+            notify_in: 0,
+            deferred: [false; 3],
+            out_turn: false,
+            partial: Vec::new(),
+            user: VecDeque::new(),
+            input: Vec::new(),
+            output: VecDeque::new(),
+            reading: true,
+            outcomes: VecDeque::new(),
+            enumerations: 0,
+        }
+    }
+
+    /// The device is gone: the application's port with it. What was delivered stays readable.
+    pub(super) fn detach(&mut self) {
+        *self = Self {
+            last_address: self.last_address,
+            identity: self.identity.take(),
+            input: std::mem::take(&mut self.input),
+            reading: self.reading,
+            outcomes: std::mem::take(&mut self.outcomes),
+            enumerations: self.enumerations,
+            ..Self::new()
+        };
+    }
+
+    pub(super) fn address(&self) -> u8 {
+        self.address
+    }
+
+    pub(super) fn ready(&self) -> bool {
+        self.configured
+    }
+
+    pub(super) fn port_ready(&self) -> bool {
+        self.configured && self.port_wanted && self.port_open
+    }
+
+    pub(super) fn failure(&self) -> Option<&EnumerationError> {
+        self.failure.as_ref()
+    }
+
+    pub(super) fn identity(&self) -> Option<&Identity> {
+        self.identity.as_ref()
+    }
+
+    pub(super) fn open_port(&mut self) {
+        self.port_wanted = true;
+    }
+
+    pub(super) fn close_port(&mut self) {
+        self.port_wanted = false;
+        self.partial.clear();
+        self.output.clear();
+    }
+
+    pub(super) fn control(&mut self, request: Request) {
+        self.user.push_back(request);
+    }
+
+    pub(super) fn take_reset_request(&mut self) -> bool {
+        std::mem::take(&mut self.reset_request)
+    }
+
+    /// Milliseconds of silence that the driver wants.
+    pub(super) fn take_pause(&mut self) -> Option<u64> {
+        self.pause.take()
+    }
+
+    /// The port's reset is over: the first look, or what follows the second.
+    pub(super) fn after_reset(&mut self) {
+        self.resets += 1;
+        self.address = 0;
+        self.begin(if self.resets == 1 { Purpose::FirstLook } else { Purpose::Address });
+    }
+
+    pub(super) fn start_frame(&mut self) {
+        self.notify_in = self.notify_in.saturating_sub(1);
+    }
+
+    pub(super) fn restart_clock(&mut self) {
+        if let Some(pending) = &mut self.pending {
+            pending.started = None;
+        }
+    }
+
+    /// Fails a control transfer that takes too long.
+    pub(super) fn check_time(&mut self, now: u64, limit: u64) {
+        if let Some(pending) = &mut self.pending {
+            let started = *pending.started.get_or_insert(now);
+            if now - started > limit {
+                self.ended(Outcome::Failed("answered with NAK for too long"));
+            }
+        }
+    }
+
+    fn begin(&mut self, purpose: Purpose) {
+        let descriptor = |kind: u16, index: u16, language: u16, length: u16| {
+            Request::new(FROM_DEVICE, GET_DESCRIPTOR, kind << 8 | index, language, length)
+        };
+        let interface = self.acm.map_or(0, |acm| u16::from(acm.control_interface));
+        let request = match purpose {
+            Purpose::FirstLook => descriptor(1, 0, 0, 64),
+            Purpose::Address => {
+                self.last_address = self.last_address % 127 + 1;
+                Request::new(TO_DEVICE, SET_ADDRESS, u16::from(self.last_address), 0, 0)
+            }
+            Purpose::DeviceDescriptor => descriptor(1, 0, 0, 18),
+            Purpose::Qualifier => descriptor(6, 0, 0, 10),
+            Purpose::ObjectStore => descriptor(15, 0, 0, 5),
+            Purpose::ConfigurationHead => descriptor(2, 0, 0, 9),
+            Purpose::Configuration => descriptor(2, 0, 0, self.configuration_length),
+            Purpose::Languages => descriptor(3, 0, 0, 255),
+            Purpose::Text(which) => {
+                let index = self.device.map_or(0, |device| device.strings[which]);
+                descriptor(3, u16::from(index), self.language, 255)
+            }
+            Purpose::Configure => {
+                let value = self.acm.map_or(0, |acm| u16::from(acm.configuration));
+                Request::new(TO_DEVICE, SET_CONFIGURATION, value, 0, 0)
+            }
+            Purpose::PutCoding => {
+                let coding = LineCoding::default().0.to_vec();
+                Request::with_data(CLASS_OUT, SET_LINE_CODING, 0, interface, coding)
+            }
+            Purpose::GetCoding => Request::new(CLASS_IN, GET_LINE_CODING, 0, interface, 7),
+            Purpose::Lines => {
+                // DTR and RTS.
+                self.lines_sent = self.port_wanted;
+                let lines = if self.port_wanted { 3 } else { 0 };
+                Request::new(CLASS_OUT, SET_CONTROL_LINE_STATE, lines, interface, 0)
+            }
+            Purpose::User => match self.user.pop_front() {
+                Some(request) => request,
+                None => return,
+            },
+        };
+        self.pending = Some(Pending { purpose, transfer: Transfer::new(request), started: None });
+    }
+
+    /// Begins the control transfer that is due on a configured device, if any is.
+    fn begin_next(&mut self) {
+        if !self.configured || self.pending.is_some() {
+            return;
+        }
+        if self.port_wanted != self.port_open {
+            let coding_first = self.port_wanted && !self.coding_set;
+            self.begin(if coding_first { Purpose::PutCoding } else { Purpose::Lines });
+        } else if !self.user.is_empty() {
+            self.begin(Purpose::User);
+        }
+    }
+
+    /// The next transaction. `room` says whether the frame may carry another data packet on the bulk
+    /// pipes.
+    pub(super) fn choose(&mut self, room: bool) -> Option<Token> {
+        self.begin_next();
+        if let Some(pending) = self.pending.as_ref().filter(|_| !self.deferred[0]) {
+            return Some(match pending.transfer.step(self.ep0_packet) {
+                Step::Setup(packet) => Token::Setup(packet),
+                Step::In => Token::In { endpoint: 0, bulk: false },
+                Step::Out { data1, bytes } => Token::Out { endpoint: 0, data1, bytes },
+            });
+        }
+        let acm = self.acm.filter(|_| self.configured && self.port_open)?;
+        if self.notify_in == 0 {
+            self.notify_in = u32::from(acm.notification.interval);
+            return Some(Token::In { endpoint: acm.notification.number, bulk: false });
+        }
+        if !room {
+            return None;
+        }
+        let input = self.reading && self.port_wanted && self.input.len() < INPUT_LIMIT && !self.deferred[1];
+        let output = !self.output.is_empty() && !self.deferred[2];
+        self.out_turn = output && (self.out_turn || !input);
+        if self.out_turn {
+            let bytes = self.output.iter().take(usize::from(acm.output.packet)).copied().collect();
+            self.out_turn = false;
+            return Some(Token::Out { endpoint: acm.output.number, data1: self.out_data1, bytes });
+        }
+        self.out_turn = true;
+        input.then_some(Token::In { endpoint: acm.input.number, bulk: true })
+    }
+
+    /// A pipe said NAK: the others first.
+    pub(super) fn defer(&mut self, endpoint: u8, input: bool) {
+        let pipe = match (endpoint, input) {
+            (0, _) => 0,
+            (_, true) => 1,
+            (_, false) => 2,
+        };
+        let notification = input && self.acm.is_some_and(|acm| acm.notification.number == endpoint);
+        if !notification {
+            self.deferred[pipe] = true;
+        }
+    }
+
+    /// Whether there is anything to be tried again.
+    pub(super) fn any_deferred(&self) -> bool {
+        self.deferred.contains(&true)
+    }
+
+    pub(super) fn clear_deferred(&mut self) {
+        self.deferred = [false; 3];
+    }
+
+    /// The answer to a SETUP or OUT packet; `pipe` is the length of a bulk packet.
+    pub(super) fn answered_out(&mut self, pipe: Option<usize>, reply: OutReply, counters: &mut Counters) {
+        let Some(length) = pipe else {
+            let packet = self.ep0_packet;
+            let outcome = self.pending.as_mut().and_then(|pending| pending.transfer.on_out(reply, packet));
+            return outcome.into_iter().for_each(|outcome| self.ended(outcome));
+        };
+        match reply {
+            OutReply::Ack => {
+                self.output.drain(..length.min(self.output.len()));
+                self.out_data1 = !self.out_data1;
+                counters.out_packets += 1;
+            }
+            OutReply::Nak => {}
+            OutReply::Silence => counters.silences += 1,
+            OutReply::Stall => counters.stalls += 1,
+        }
+    }
+
+    /// The answer to an IN token.
+    pub(super) fn answered_in(
+        &mut self,
+        endpoint: u8,
+        bulk: bool,
+        reply: InReply,
+        read_bytes: usize,
+        counters: &mut Counters,
+    ) {
+        if endpoint == 0 {
+            let packet = self.ep0_packet;
+            let outcome = self.pending.as_mut().and_then(|pending| pending.transfer.on_in(reply, packet));
+            return outcome.into_iter().for_each(|outcome| self.ended(outcome));
+        }
+        let (data1, bytes) = match reply {
+            InReply::Data { data1, bytes } => (data1, bytes),
+            InReply::Nak => return,
+            InReply::Silence => return counters.silences += 1,
+            InReply::Stall => return counters.stalls += 1,
+        };
+        let expected = if bulk { &mut self.in_data1 } else { &mut self.notify_data1 };
+        if data1 != *expected {
+            counters.repeated += 1;
+            return;
+        }
+        *expected = !data1;
+        if !bulk {
+            counters.notifications += 1;
+            return;
+        }
+        counters.in_packets += 1;
+        counters.in_bytes += bytes.len() as u64;
+        let full = self.acm.is_some_and(|acm| usize::from(acm.input.packet) == bytes.len());
+        self.partial.extend_from_slice(&bytes);
+        if !full || self.partial.len() >= read_bytes {
+            self.input.append(&mut self.partial);
+        }
+    }
+
+    fn ended(&mut self, outcome: Outcome) {
+        let Some(Pending { purpose, .. }) = self.pending.take() else {
+            return;
+        };
+        if purpose == Purpose::User {
+            self.outcomes.push_back(outcome);
+            return;
+        }
+        let result = match outcome {
+            Outcome::Done(bytes) => self.advance(purpose, &bytes),
+            // A full-speed device has no other speed to qualify.
+            Outcome::Stalled if purpose == Purpose::Qualifier => {
+                self.after_device_descriptor();
+                Ok(())
+            }
+            Outcome::Stalled => Err(EnumerationError::Refused(purpose.name())),
+            Outcome::Failed(how) => Err(EnumerationError::Transfer { what: purpose.name(), how }),
+        };
+        if let Err(error) = result {
+            self.configured = false;
+            self.failure = Some(error);
+        }
+    }
+
+    fn after_device_descriptor(&mut self) {
+        // The binary object store exists from USB 2.01 on.
+        self.begin(if self.usb_version > 0x0200 { Purpose::ObjectStore } else { Purpose::ConfigurationHead });
+    }
+
+    /// Uses what a control transfer brought and begins the next.
+    fn advance(&mut self, purpose: Purpose, bytes: &[u8]) -> Result<(), EnumerationError> {
+        let short = |what: &str| Err(EnumerationError::Descriptor(what.to_owned()));
+        match purpose {
+            Purpose::FirstLook => {
+                let Some(&packet) = bytes.get(7) else {
+                    return short("fewer than 8 bytes of the device descriptor");
+                };
+                self.ep0_packet = usize::from(packet);
+                self.reset_request = true;
+            }
+            Purpose::Address => {
+                self.address = self.last_address;
+                self.pause = Some(ADDRESS_PAUSE_MS);
+                self.begin(Purpose::DeviceDescriptor);
+            }
+            Purpose::DeviceDescriptor => {
+                self.device = Some(descriptors::device(bytes)?);
+                self.usb_version = u16::from_le_bytes([bytes[2], bytes[3]]);
+                self.begin(Purpose::Qualifier);
+            }
+            Purpose::Qualifier => return short("a full-speed device has a device qualifier"),
+            Purpose::ObjectStore => {
+                if bytes.len() != 5 || bytes[0] != 5 || bytes[1] != 15 {
+                    return short("the binary object store is malformed");
+                }
+                self.begin(Purpose::ConfigurationHead);
+            }
+            Purpose::ConfigurationHead => {
+                self.configuration_length = descriptors::configuration_length(bytes)?;
+                self.begin(Purpose::Configuration);
+            }
+            Purpose::Configuration => {
+                self.acm = Some(descriptors::cdc_acm(bytes)?);
+                self.begin(Purpose::Languages);
+            }
+            Purpose::Languages => {
+                self.language = descriptors::language(bytes)?;
+                self.begin_text(0);
+            }
+            Purpose::Text(which) => {
+                self.strings[which] = descriptors::string(bytes)?;
+                self.begin_text(which + 1);
+            }
+            Purpose::Configure => self.configured(),
+            Purpose::PutCoding => self.begin(Purpose::GetCoding),
+            Purpose::GetCoding => {
+                if bytes != LineCoding::default().0 {
+                    return short("GET_LINE_CODING does not give what SET_LINE_CODING set");
+                }
+                self.coding_set = true;
+            }
+            Purpose::Lines => self.port_open = self.lines_sent,
+            Purpose::User => {}
+        }
+        Ok(())
+    }
+
+    /// The next string that the device has, or what follows them.
+    fn begin_text(&mut self, from: usize) {
+        let strings = self.device.map_or([0; 3], |device| device.strings);
+        let next = (from..strings.len()).find(|which| strings[*which] != 0);
+        self.begin(next.map_or(Purpose::Configure, Purpose::Text));
+    }
+
+    fn configured(&mut self) {
+        self.configured = true;
+        self.enumerations += 1;
+        (self.in_data1, self.out_data1, self.notify_data1) = (false, false, false);
+        if let (Some(device), Some(acm)) = (self.device, self.acm) {
+            self.identity = Some(Identity { device, acm, strings: self.strings.clone() });
+        }
+    }
+}

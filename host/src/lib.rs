@@ -6,6 +6,8 @@ pub mod device;
 pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
+#[cfg(feature = "signals")]
+pub mod signals;
 pub mod socketcan;
 #[cfg(feature = "stats")]
 pub mod stats;

@@ -1,0 +1,240 @@
+//! The text of a DBC file before it is parsed: its encoding, and which line says what.
+//!
+//! can-dbc's result has no positions, so the lines of messages and signals are found here. A
+//! statement starts on its own line; a string may run over several.
+
+use std::borrow::Cow;
+use std::collections::HashMap;
+use std::ops::Range;
+
+/// Statements that say nothing about how frames are decoded.
+const NEEDLESS: &[&str] = &[
+    "VERSION",
+    "NS_",
+    "BS_",
+    "BU_",
+    "CM_",
+    "BA_DEF_",
+    "BA_DEF_DEF_",
+    "BA_DEF_REL_",
+    "BA_DEF_DEF_REL_",
+    "BA_DEF_SGTYPE_",
+    "BA_REL_",
+    "BA_SGTYPE_",
+    "BA_",
+    "EV_",
+    "EV_DATA_",
+    "ENVVAR_DATA_",
+    "BO_TX_BU_",
+    "BU_SG_REL_",
+    "BU_EV_REL_",
+    "BU_BO_REL_",
+    "CAT_",
+    "CAT_DEF_",
+    "FILTER",
+    "SGTYPE_",
+    "SGTYPE_VAL_",
+    "SIGTYPE_VALTYPE_",
+    "SIG_TYPE_REF_",
+    "SIG_GROUP_",
+    "SIG_TYPE_DEF_",
+    "SIG_TYPE_",
+    "VAL_TABLE_",
+];
+
+/// Statements that do.
+const NEEDED: &[&str] = &["BO_", "SG_", "VAL_", "SIG_VALTYPE_", "SG_MUL_VAL_"];
+
+/// DBC files are in Windows' Western code page; newer tools write UTF-8.
+pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
+    let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
+    match str::from_utf8(bytes) {
+        Ok(text) => Cow::Borrowed(text),
+        Err(_) => can_dbc::encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
+    }
+}
+
+/// A statement's place in the text.
+#[derive(Debug)]
+pub struct Statement {
+    /// Its first line, from 1.
+    pub line: u32,
+    /// Its bytes, up to the next statement.
+    pub range: Range<usize>,
+    /// Its first word.
+    pub keyword: String,
+    /// `Message` or `Message.Signal` for definitions, else the keyword and the words after it.
+    pub symbol: String,
+}
+
+impl Statement {
+    /// Whether decoding can do without it.
+    pub fn is_needless(&self) -> bool {
+        NEEDLESS.contains(&self.keyword.as_str())
+    }
+}
+
+/// Where everything is.
+#[derive(Debug, Default)]
+pub struct Index {
+    /// In the order of the text.
+    pub statements: Vec<Statement>,
+    /// Identifier as written in the file, and name, of each `BO_` with its line.
+    pub messages: Vec<(u64, String, u32)>,
+    /// Lines of signals by their message's place in `messages` and their name.
+    signals: HashMap<(usize, String), u32>,
+}
+
+impl Index {
+    /// Finds all statements.
+    pub fn of(text: &str) -> Self {
+        let mut index = Self::default();
+        let mut in_string = false;
+        let mut in_symbols = false;
+        let mut offset = 0;
+        for (number, line) in text.split_inclusive('\n').enumerate() {
+            if !in_string {
+                // The list after NS_ names keywords on indented lines of their own.
+                in_symbols &= line.starts_with([' ', '\t', '\r', '\n']);
+                if !in_symbols {
+                    index.start_statement(line, number as u32 + 1, offset);
+                }
+                in_symbols |= line.trim_start().starts_with("NS_");
+            }
+            in_string = ends_in_string(line, in_string);
+            offset += line.len();
+            if let Some(statement) = index.statements.last_mut() {
+                statement.range.end = offset;
+            }
+        }
+        index
+    }
+
+    fn start_statement(&mut self, line: &str, number: u32, offset: usize) {
+        let mut words = line.split(|c: char| c.is_ascii_whitespace() || c == ':').filter(|w| !w.is_empty());
+        let Some(keyword) = words.next() else { return };
+        if !NEEDED.contains(&keyword) && !NEEDLESS.contains(&keyword) {
+            // Something unheard of is a statement of its own if it looks like one.
+            let looks_like = keyword.len() > 1
+                && keyword.ends_with('_')
+                && keyword.bytes().all(|byte| byte.is_ascii_uppercase() || byte == b'_');
+            if !looks_like {
+                return;
+            }
+        }
+        let (first, second) = (words.next().unwrap_or_default(), words.next().unwrap_or_default());
+        let symbol = match keyword {
+            "BO_" => {
+                if let Ok(id) = first.parse() {
+                    self.messages.push((id, second.to_owned(), number));
+                }
+                second.to_owned()
+            }
+            "SG_" => {
+                let message = self.messages.len().checked_sub(1);
+                let message_name = message.map_or("", |message| self.messages[message].1.as_str());
+                let symbol = format!("{message_name}.{first}");
+                if let Some(message) = message {
+                    self.signals.entry((message, first.to_owned())).or_insert(number);
+                }
+                symbol
+            }
+            _ => [keyword, first, second].join(" ").trim_end().to_owned(),
+        };
+        let range = offset..offset;
+        self.statements.push(Statement { line: number, range, keyword: keyword.to_owned(), symbol });
+    }
+
+    /// The line of the `message`th message; 0 if unknown.
+    pub fn message_line(&self, message: usize) -> u32 {
+        self.messages.get(message).map_or(0, |&(_, _, line)| line)
+    }
+
+    /// The line of a signal of the `message`th message; 0 if unknown.
+    pub fn signal_line(&self, message: usize, name: &str) -> u32 {
+        self.signals.get(&(message, name.to_owned())).copied().unwrap_or_default()
+    }
+
+    /// The statement that a line belongs to.
+    pub fn statement_at(&self, line: u32) -> Option<&Statement> {
+        let after = self.statements.partition_point(|statement| statement.line <= line);
+        self.statements.get(after.checked_sub(1)?)
+    }
+
+    /// The first statement of that keyword whose words after it are those.
+    pub fn find(&self, text: &str, keyword: &str, words: &[&str]) -> Option<&Statement> {
+        self.statements.iter().find(|statement| {
+            let mut found =
+                text[statement.range.clone()].split([' ', '\t', ':', ';']).filter(|w| !w.is_empty());
+            statement.keyword == keyword
+                && found.next() == Some(keyword)
+                && words.iter().all(|&word| found.next() == Some(word))
+        })
+    }
+}
+
+/// Whether a string is open at the line's end. `\"` inside one does not close it.
+fn ends_in_string(line: &str, mut in_string: bool) -> bool {
+    let mut bytes = line.bytes().peekable();
+    while let Some(byte) = bytes.next() {
+        match byte {
+            b'\\' if in_string && bytes.peek() == Some(&b'"') => {
+                bytes.next();
+            }
+            b'"' => in_string = !in_string,
+            b'/' if !in_string && bytes.peek() == Some(&b'/') => break,
+            _ => {}
+        }
+    }
+    in_string
+}
+
+/// Replaces a statement by spaces, so that everything else keeps its place.
+pub fn blank(text: &str, range: Range<usize>) -> String {
+    let spaces = text[range.clone()].chars().map(|c| if c == '\n' || c == '\r' { c } else { ' ' });
+    let mut blanked = text[..range.start].to_owned();
+    blanked.extend(spaces);
+    blanked.push_str(&text[range.end..]);
+    blanked
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TEXT: &str = "VERSION \"\"\nNS_ :\n\tCM_\n\tVAL_\n\nBU_: A\n\nBO_ 5 First: 8 A\n SG_ One : 0|8@1+ (1,0) [0|0] \"\" A\n\
+                        CM_ BO_ 5 \"BO_ 6 \\\"No\\\"\nBO_ 7 Neither: 8 A\";\nBO_ 8 Last : 8 A\n SG_ One m0 : 0|8@1+ (1,0) [0|0] \"\" A\n";
+
+    #[test]
+    fn statements_are_found_and_strings_are_not() {
+        let index = Index::of(TEXT);
+        let found: Vec<_> = index.statements.iter().map(|s| (s.line, s.symbol.as_str())).collect();
+        assert_eq!(
+            found,
+            [
+                (1, "VERSION \"\""),
+                (2, "NS_"),
+                (6, "BU_ A"),
+                (8, "First"),
+                (9, "First.One"),
+                (10, "CM_ BO_ 5"),
+                (12, "Last"),
+                (13, "Last.One")
+            ]
+        );
+        assert_eq!(
+            (index.message_line(1), index.signal_line(0, "One"), index.signal_line(1, "One")),
+            (12, 9, 13)
+        );
+        assert_eq!(index.statement_at(11).map(|s| s.line), Some(10));
+    }
+
+    #[test]
+    fn a_blanked_statement_moves_nothing() {
+        let index = Index::of(TEXT);
+        let blanked = blank(TEXT, index.statements[5].range.clone());
+        assert_eq!(blanked.lines().count(), TEXT.lines().count());
+        assert_eq!(Index::of(&blanked).signal_line(1, "One"), 13);
+        assert!(!blanked.contains("Neither"));
+    }
+}

@@ -1,0 +1,68 @@
+//! A physical value without loss: 64-bit counters do not fit a float.
+
+use std::fmt;
+
+/// A signal's physical value, exact.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Number {
+    /// Integer raw value with integer factor and offset. Wide enough for every product of 64-bit
+    /// raw values and factors.
+    Integer(i128),
+    /// Everything else.
+    Real(f64),
+}
+
+impl Number {
+    /// The nearest float.
+    pub fn as_f64(self) -> f64 {
+        match self {
+            Self::Integer(value) => value as f64,
+            Self::Real(value) => value,
+        }
+    }
+
+    /// Whether it is a number that JSON can carry: neither infinite nor not-a-number.
+    pub fn is_finite(self) -> bool {
+        match self {
+            Self::Integer(_) => true,
+            Self::Real(value) => value.is_finite(),
+        }
+    }
+}
+
+impl fmt::Display for Number {
+    /// The shortest decimal that reads back as the same value; it is also a JSON number if finite.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Integer(value) => fmt::Display::fmt(value, f),
+            Self::Real(value) => {
+                // Display never uses an exponent: the extremes of a double would run to 300 digits.
+                let size = value.abs();
+                if value.is_finite() && size != 0.0 && !(1e-7..1e17).contains(&size) {
+                    fmt::LowerExp::fmt(value, f)
+                } else {
+                    fmt::Display::fmt(value, f)
+                }
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_print_short_and_exact() {
+        for (number, text) in [
+            (Number::Integer(u64::MAX.into()), "18446744073709551615"),
+            (Number::Real(5119.5), "5119.5"),
+            (Number::Real(88.0), "88"),
+            (Number::Real(0.1 + 0.2), "0.30000000000000004"),
+            (Number::Real(-1.5e300), "-1.5e300"),
+            (Number::Real(4e-9), "4e-9"),
+        ] {
+            assert_eq!(number.to_string(), text);
+        }
+    }
+}

@@ -5,11 +5,12 @@
 //! another ended at unknown times before now: their stamp says so, and the host tightens it.
 
 use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
-use cantap_wire::record::{LossStage, Stamp, TransmitFailure};
+use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
 
 use crate::QUEUE_BYTES;
 use crate::errors::ErrorMonitor;
+use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 use crate::queue::Producer;
 use crate::recorder::Recorder;
@@ -33,6 +34,8 @@ struct ChannelState {
 pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     recorder: Recorder<'q, N>,
     channels: [ChannelState; CHANNELS],
+    /// Per channel, frames and mishaps at the last [`Self::take_activity`].
+    seen: [(u32, u32); CHANNELS],
 }
 
 impl<'q, const N: usize> Capture<'q, N> {
@@ -49,7 +52,11 @@ impl<'q, const N: usize> Capture<'q, N> {
                 transmitter: Transmitter::new(channel),
             }
         }
-        Self { recorder: Recorder::new(producer), channels: [state(Channel::Can1), state(Channel::Can2)] }
+        Self {
+            recorder: Recorder::new(producer),
+            channels: [state(Channel::Can1), state(Channel::Can2)],
+            seen: [(0, 0); CHANNELS],
+        }
     }
 
     /// The receive interrupt. `entered` is the clock, read before anything else.
@@ -166,7 +173,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         recorder: &mut Recorder<'_, N>,
         now: u64,
     ) {
-        let off = state.errors.status().state == cantap_wire::record::ErrorState::BusOff;
+        let off = state.errors.status().state == ErrorState::BusOff;
         if off && state.open.is_some_and(|config| config.manual_recovery) && state.transmitter.pending() > 0 {
             state.abort_reason = TransmitFailure::BusOff;
             state.transmitter.drop_all(TransmitFailure::BusOff, traffic);
@@ -299,6 +306,22 @@ impl<'q, const N: usize> Capture<'q, N> {
     pub fn registers(&self, channel: Channel, traffic: &impl Traffic) -> Registers {
         let at_last_error = self.channels[channel.index()].errors.registers();
         Registers { now: traffic.registers(), at_last_error }
+    }
+
+    /// What happened since the last call, for the LEDs.
+    pub fn take_activity(&mut self) -> Activity {
+        let seen = Channel::ALL.map(|channel| {
+            let state = &self.channels[channel.index()];
+            let (sent, failed) = state.transmitter.counters();
+            let lost = self.recorder.lost(channel).wrapping_add(state.overruns);
+            let traffic = state.frames.wrapping_add(sent);
+            (traffic, state.errors.errors().wrapping_add(lost).wrapping_add(failed))
+        });
+        let bus_off = self.channels.iter().any(|state| state.errors.status().state == ErrorState::BusOff);
+        let new = |part: fn(&(u32, u32)) -> u32| seen.iter().map(part).ne(self.seen.iter().map(part));
+        let activity = Activity { traffic: new(|seen| seen.0), error: bus_off || new(|seen| seen.1) };
+        self.seen = seen;
+        activity
     }
 
     /// Bytes in the queue, and the most there ever were.

@@ -1,4 +1,15 @@
 //! The firmware's RTIC application: which interrupt does what, at which priority.
+//!
+//! | priority | tasks | why |
+//! |---|---|---|
+//! | 4 | both channels' receive, transmit and error interrupts, the transmission alarm | a FIFO of three frames waits for nobody |
+//! | 2 | USB, the millisecond tick | a host can be told to wait |
+//! | – | idle | sleeps |
+//!
+//! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock.
+//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI: each lock delays a stamp by its
+//! length. The USB driver masks all interrupts inside its `poll` and packet writes; `docs/benchmarks.md` tells for
+//! how long.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 #[cfg(target_os = "none")]
@@ -14,36 +25,179 @@ fn main() {
 #[cfg(target_os = "none")]
 #[rtic::app(device = stm32f4xx_hal::pac, peripherals = true)]
 mod app {
+    use cantap_firmware::capture::Capture;
+    use cantap_firmware::filters::Layout;
     use cantap_firmware::lights::Activity;
-    use cantap_firmware::ports::Port;
+    use cantap_firmware::ports::{Clock, FilterBanks};
+    use cantap_firmware::queue::RecordQueue;
+    use cantap_firmware::session::Session;
+    use cantap_wire::Channel;
 
-    use crate::hw;
+    use crate::hw::access::{Access, Controls, Tap};
+    use crate::hw::stamp::StampTimer;
+    use crate::hw::tick::Tick;
+    use crate::hw::usb::{Memory, UsbPort};
+    use crate::hw::watchdog::Watchdog;
+    use crate::hw::{self, Hardware};
 
     #[shared]
-    struct Shared {}
+    struct Shared {
+        /// Ceiling 4: what the capture interrupts own.
+        tap: Tap,
+        /// Only at priority 2.
+        #[lock_free]
+        session: Session<'static>,
+        /// Only at priority 2.
+        #[lock_free]
+        usb: UsbPort,
+        /// Only at priority 2.
+        #[lock_free]
+        controls: Controls,
+    }
 
     #[local]
     struct Local {
-        hw: hw::Hardware,
+        tick: Tick,
+        watchdog: Watchdog,
+        can1_clock: StampTimer,
+        can2_clock: StampTimer,
+        can1_tx_clock: StampTimer,
+        can2_tx_clock: StampTimer,
+        can1_error_clock: StampTimer,
+        can2_error_clock: StampTimer,
+        alarm_clock: StampTimer,
     }
 
-    #[init(local = [usb_memory: hw::usb::Memory = hw::usb::Memory::new()])]
+    #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let hw = hw::start(cx.device, cx.local.usb_memory);
-        (Shared {}, Local { hw })
+        let Hardware { can, stamp, tick, usb, chip, watchdog, identity } =
+            hw::start(cx.device, cx.local.usb_memory);
+        let mut filters = can.filters;
+        filters.write(&Layout::open());
+        let (producer, consumer) = cx.local.records.split();
+        (
+            Shared {
+                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, stamp },
+                session: Session::new(consumer, identity),
+                usb,
+                controls: Controls { can: can.control, filters, chip, stamp },
+            },
+            Local {
+                tick,
+                watchdog,
+                can1_clock: stamp,
+                can2_clock: stamp,
+                can1_tx_clock: stamp,
+                can2_tx_clock: stamp,
+                can1_error_clock: stamp,
+                can2_error_clock: stamp,
+                alarm_clock: stamp,
+            },
+        )
     }
 
-    #[task(binds = TIM7, local = [hw])]
+    /// Moves frames from CAN1's FIFO 0 to the record queue.
+    ///
+    /// Priority 4, the highest: FIFO 0 holds three frames (RM0090 Rev 21 §32.7.3) and no frame is shorter than
+    /// 47 µs at 1 Mbit/s, so starting later than 141 µs after the first loses the fourth. Each microsecond of delay is one
+    /// in the stamp. `otg_fs` (2) may wait: USB can NAK.
+    #[task(binds = CAN1_RX0, priority = 4, local = [can1_clock], shared = [tap])]
+    fn can1_rx0(mut cx: can1_rx0::Context) {
+        let entered = cx.local.can1_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], stamp }| {
+            capture.on_receive(Channel::Can1, can1, stamp, entered);
+        });
+    }
+
+    /// As [`can1_rx0`], for CAN2. When both come at once this one waits for the other's few microseconds.
+    #[task(binds = CAN2_RX0, priority = 4, local = [can2_clock], shared = [tap])]
+    fn can2_rx0(mut cx: can2_rx0::Context) {
+        let entered = cx.local.can2_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
+            capture.on_receive(Channel::Can2, can2, stamp, entered);
+        });
+    }
+
+    /// Confirms what CAN1 has sent and fills its mailboxes again.
+    ///
+    /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
+    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
+    #[task(binds = CAN1_TX, priority = 4, local = [can1_tx_clock], shared = [tap])]
+    fn can1_tx(mut cx: can1_tx::Context) {
+        let entered = cx.local.can1_tx_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], stamp }| {
+            capture.on_transmit(Channel::Can1, can1, stamp, entered);
+        });
+    }
+
+    /// As [`can1_tx`], for CAN2.
+    #[task(binds = CAN2_TX, priority = 4, local = [can2_tx_clock], shared = [tap])]
+    fn can2_tx(mut cx: can2_tx::Context) {
+        let entered = cx.local.can2_tx_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
+            capture.on_transmit(Channel::Can2, can2, stamp, entered);
+        });
+    }
+
+    /// Records CAN1's errors and changes of state.
+    ///
+    /// Priority 4, because it writes records. The controller keeps one error: a second one before this starts, at least
+    /// 14 bits later, replaces it uncounted.
+    #[task(binds = CAN1_SCE, priority = 4, local = [can1_error_clock], shared = [tap])]
+    fn can1_sce(mut cx: can1_sce::Context) {
+        let entered = cx.local.can1_error_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], .. }| {
+            capture.on_error(Channel::Can1, can1, entered);
+        });
+    }
+
+    /// As [`can1_sce`], for CAN2.
+    #[task(binds = CAN2_SCE, priority = 4, local = [can2_error_clock], shared = [tap])]
+    fn can2_sce(mut cx: can2_sce::Context) {
+        let entered = cx.local.can2_error_clock.now();
+        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], .. }| {
+            capture.on_error(Channel::Can2, can2, entered);
+        });
+    }
+
+    /// Sends what is due.
+    ///
+    /// Priority 4, because it writes mailboxes and records. Each microsecond of delay is one that a frame leaves late.
+    #[task(binds = TIM2, priority = 4, local = [alarm_clock], shared = [tap])]
+    fn tim2(mut cx: tim2::Context) {
+        cx.local.alarm_clock.acknowledge();
+        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| capture.on_alarm(traffic, stamp));
+    }
+
+    /// Talks to the host.
+    ///
+    /// Priority 2: the host waits for as long as it must (USB NAK), except that a bus reset wants an answer within 10 ms
+    /// (USB 2.0 §7.1.7.5) and a control request within 50 ms (§9.2.6.4), or the enumeration fails.
+    #[task(binds = OTG_FS, priority = 2, shared = [tap, session, usb, controls])]
+    fn otg_fs(cx: otg_fs::Context) {
+        let otg_fs::SharedResources { tap, session, usb, controls, .. } = cx.shared;
+        usb.poll();
+        session.poll(usb, &mut Access { tap, controls });
+    }
+
+    /// Once a millisecond: flushes batches, keeps time, looks after what no interrupt tells, feeds the watchdog.
+    ///
+    /// Priority 2, with USB, because it talks to the host too. A tick that is late by milliseconds delays a batch; one that
+    /// is late by four seconds restarts the chip.
+    #[task(binds = TIM7, priority = 2, local = [tick, watchdog], shared = [tap, session, usb, controls])]
     fn tim7(cx: tim7::Context) {
-        let hw = cx.local.hw;
-        hw.tick.acknowledge();
-        hw.watchdog.feed();
-        hw.chip.tick(Activity::default());
-        hw.usb.poll();
-        let mut packet = [0; 64];
-        while hw.usb.read(&mut packet).is_some() {}
+        let tim7::SharedResources { mut tap, session, usb, controls, .. } = cx.shared;
+        cx.local.tick.acknowledge();
+        cx.local.watchdog.feed();
+        let activity = tap.lock(|Tap { capture, traffic, stamp }| {
+            capture.on_tick(traffic, stamp);
+            capture.take_activity()
+        });
+        controls.chip.tick(activity);
+        session.poll(usb, &mut Access { tap, controls });
     }
 
+    /// Sleeps until the next interrupt.
     #[idle]
     fn idle(_: idle::Context) -> ! {
         loop {

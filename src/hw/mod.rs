@@ -1,6 +1,7 @@
 //! The board's side of the firmware: the logic's traits over stm32f4xx-hal and the chip's registers. The only
 //! place with `unsafe`. What is decided here is how, never what: that is the logic's.
 
+pub mod access;
 pub mod can;
 pub mod chip;
 mod flash;

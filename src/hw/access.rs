@@ -1,0 +1,72 @@
+//! Joins the session, at low priority, to what the capture interrupts own: [`Board`] over the board.
+
+use cantap_firmware::QUEUE_BYTES;
+use cantap_firmware::capture::Capture;
+use cantap_firmware::ports::{Board, Clock};
+use cantap_wire::{CHANNELS, Channel};
+use rtic::Mutex;
+
+use super::can::{CanControl, CanFilters, CanTraffic};
+use super::chip::BoardChip;
+use super::stamp::StampTimer;
+
+/// What the highest-priority interrupts own.
+pub struct Tap {
+    /// The logic.
+    pub capture: Capture<'static>,
+    /// The controllers' traffic halves.
+    pub traffic: [CanTraffic; CHANNELS],
+    /// The stamp timer, whose alarm is set only from here.
+    pub stamp: StampTimer,
+}
+
+/// What commands own.
+pub struct Controls {
+    /// The controllers' control halves.
+    pub can: [CanControl; CHANNELS],
+    /// The acceptance filters.
+    pub filters: CanFilters,
+    /// The chip.
+    pub chip: BoardChip,
+    /// The stamp timer, to be read.
+    pub stamp: StampTimer,
+}
+
+/// Commands' own, and the way to the rest.
+pub struct Access<'a, T> {
+    /// The resource to lock: it raises the priority to the capture's for as long as it is held.
+    pub tap: T,
+    /// What needs no lock.
+    pub controls: &'a mut Controls,
+}
+
+impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
+    type Traffic = CanTraffic;
+    type Control = CanControl;
+    type Clock = StampTimer;
+    type Filters = CanFilters;
+    type Chip = BoardChip;
+
+    fn with_capture<R>(
+        &mut self,
+        act: impl FnOnce(&mut Capture<'static>, &mut [CanTraffic; CHANNELS], &StampTimer) -> R,
+    ) -> R {
+        self.tap.lock(|tap| act(&mut tap.capture, &mut tap.traffic, &tap.stamp))
+    }
+
+    fn now(&self) -> u32 {
+        self.controls.stamp.now()
+    }
+
+    fn control(&mut self, channel: Channel) -> &mut CanControl {
+        &mut self.controls.can[channel.index()]
+    }
+
+    fn filters(&mut self) -> &mut CanFilters {
+        &mut self.controls.filters
+    }
+
+    fn chip(&mut self) -> &mut BoardChip {
+        &mut self.controls.chip
+    }
+}

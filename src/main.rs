@@ -70,8 +70,10 @@ mod app {
 
     #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let Hardware { can, stamp, tick, usb, chip, watchdog, identity } =
-            hw::start(cx.device, cx.local.usb_memory);
+        let hardware = hw::start(cx.device, cx.local.usb_memory);
+        let Hardware { can, stamp, tick, usb, mut chip, watchdog, identity, restarted_after_failure } =
+            hardware;
+        chip.tick(Activity { error: restarted_after_failure, ..Activity::default() });
         let mut filters = can.filters;
         filters.write(&Layout::open());
         let (producer, consumer) = cx.local.records.split();

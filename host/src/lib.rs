@@ -6,6 +6,8 @@ pub mod device;
 pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
+#[cfg(feature = "plot")]
+pub mod plot;
 #[cfg(feature = "signals")]
 pub mod signals;
 pub mod socketcan;

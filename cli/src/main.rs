@@ -2,6 +2,8 @@
 
 mod args;
 mod commands;
+mod databases;
+mod input;
 
 use std::process::ExitCode;
 

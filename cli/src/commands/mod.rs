@@ -1,6 +1,7 @@
 //! The subcommands. Each file has an `Args` for its command line and a `run`.
 
 pub mod bits;
+pub mod decode;
 
 use std::process::ExitCode;
 
@@ -9,6 +10,8 @@ use std::process::ExitCode;
 pub enum Command {
     /// Show a frame's exact length on the bus, stuff bits and CRC.
     Bits(bits::Args),
+    /// Show a trace as signals, by DBC or signal file.
+    Decode(decode::Args),
 }
 
 impl Command {
@@ -16,6 +19,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Bits(args) => bits::run(&args),
+            Self::Decode(args) => decode::run(&args),
         }
     }
 }

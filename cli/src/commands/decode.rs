@@ -1,0 +1,118 @@
+//! `cantap decode`: a trace as signals.
+
+mod csv;
+mod json;
+mod text;
+
+use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use cantap::TraceRecord;
+use cantap::signals::{Decoder, Message, SignalValue};
+
+use crate::databases::DatabaseArgs;
+use crate::input::ReadArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap decode --db car.dbc trace.log\n  \
+    cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
+    candump -L can0 | cantap decode --db car.dbc - --json\n\n\
+JSON lines are {\"t\", \"ch\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
+    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where a float is not a number).")]
+pub struct Args {
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// The trace; - for standard input.
+    #[arg(value_name = "IN")]
+    input: PathBuf,
+    /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Can be repeated.
+    #[arg(short, long = "signal", value_name = "PATTERN")]
+    signals: Vec<String>,
+    /// One line of CSV per signal.
+    #[arg(long, conflicts_with = "json")]
+    csv: bool,
+    /// One JSON object per message.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+/// A decoded frame, as the three outputs take it.
+struct Decoded<'a> {
+    record: &'a TraceRecord,
+    frame: &'a cantap::Frame,
+    message: &'a Message,
+    values: &'a [SignalValue],
+}
+
+/// What the summary says.
+#[derive(Default)]
+struct Count {
+    frames: u64,
+    decoded: u64,
+    signals: u64,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.databases.is_empty() {
+        anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
+    }
+    let decoder = args.databases.load_some(args.read.strict, &args.signals)?;
+    let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
+    let count = decode(args, &decoder, &mut out)?;
+    out.flush()?;
+    let Count { frames, decoded, signals } = count;
+    eprintln!("cantap: decoded {decoded} of {frames} frames, {signals} values");
+    Ok(ExitCode::SUCCESS)
+}
+
+fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<Count> {
+    let mut records = args.read.open(&args.input)?;
+    let mut count = Count::default();
+    let mut values = Vec::new();
+    if args.csv {
+        csv::write_header(out)?;
+    }
+    while let Some(record) = records.next()? {
+        let Some(frame) = record.frame() else { continue };
+        count.frames += 1;
+        let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
+        // Chosen signals only: a message without any of them is not worth a line.
+        if values.is_empty() && !args.signals.is_empty() {
+            continue;
+        }
+        count.decoded += 1;
+        count.signals += values.len() as u64;
+        let decoded =
+            Decoded { record: &record, frame, message: decoder.message(reference), values: &values };
+        match (args.json, args.csv) {
+            (true, _) => json::write(out, &decoded)?,
+            (_, true) => csv::write(out, &decoded)?,
+            _ => text::write(out, &decoded)?,
+        }
+        if records.is_live() {
+            out.flush()?;
+        }
+    }
+    Ok(count)
+}
+
+/// Seconds with six decimals, or nine where the trace has them.
+struct Seconds(i64);
+
+impl std::fmt::Display for Seconds {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let sign = if self.0 < 0 { "-" } else { "" };
+        let (seconds, ns) = (self.0.unsigned_abs() / 1_000_000_000, self.0.unsigned_abs() % 1_000_000_000);
+        if ns % 1000 == 0 {
+            write!(f, "{sign}{seconds}.{:06}", ns / 1000)
+        } else {
+            write!(f, "{sign}{seconds}.{ns:09}")
+        }
+    }
+}

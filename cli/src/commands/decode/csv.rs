@@ -1,0 +1,39 @@
+//! For spreadsheets: one line per signal (RFC 4180).
+
+use std::borrow::Cow;
+use std::io::{self, Write};
+
+use super::{Decoded, Seconds};
+
+pub fn write_header(out: &mut impl Write) -> io::Result<()> {
+    out.write_all(b"time,channel,id,message,signal,value,unit,text\r\n")
+}
+
+pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
+    let Decoded { record, frame, message, values } = decoded;
+    for value in *values {
+        let signal = &message.signals[value.signal as usize];
+        write!(
+            out,
+            "{},{},{},{},{},{},{},{}\r\n",
+            Seconds(record.time_ns),
+            record.channel,
+            frame.id(),
+            field(&message.name),
+            field(&signal.name),
+            signal.number(value.raw),
+            field(&signal.unit),
+            field(signal.text(value.raw).unwrap_or_default()),
+        )?;
+    }
+    Ok(())
+}
+
+/// Quotes what a comma, a quote or a line end would break.
+fn field(text: &str) -> Cow<'_, str> {
+    if text.contains([',', '"', '\n', '\r']) {
+        format!("\"{}\"", text.replace('"', "\"\"")).into()
+    } else {
+        text.into()
+    }
+}

@@ -1,0 +1,94 @@
+//! The signal databases that a command uses.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+
+use anyhow::{Context, bail};
+use cantap::signals::{self, Decoder, Selection, Source};
+
+/// Which databases; for commands to flatten into theirs.
+#[derive(clap::Args)]
+pub struct DatabaseArgs {
+    /// A database: a DBC file or a .toml signal file; with a channel before it (2:FILE) it is that
+    /// channel's only one, without it serves all others. Can be repeated.
+    #[arg(long = "db", value_name = "[CHANNEL:]FILE")]
+    databases: Vec<DatabasePath>,
+    /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.
+    #[arg(long)]
+    j1939: bool,
+}
+
+/// A database file and its channel.
+#[derive(Clone, Debug, PartialEq, Eq)]
+struct DatabasePath {
+    channel: Option<u8>,
+    path: PathBuf,
+}
+
+impl FromStr for DatabasePath {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        // A drive letter is no number, so that Windows' paths pass.
+        let numbered = text
+            .split_once(':')
+            .filter(|(number, _)| !number.is_empty() && number.bytes().all(|byte| byte.is_ascii_digit()));
+        let Some((number, path)) = numbered else {
+            return Ok(Self { channel: None, path: text.into() });
+        };
+        match number.parse() {
+            Ok(channel @ 1..) if !path.is_empty() => Ok(Self { channel: Some(channel), path: path.into() }),
+            _ => Err("write it as FILE or CHANNEL:FILE, with channels from 1".to_owned()),
+        }
+    }
+}
+
+impl DatabaseArgs {
+    /// Whether any was given.
+    pub fn is_empty(&self) -> bool {
+        self.databases.is_empty()
+    }
+
+    /// Loads the databases. Warnings go to standard error; with `strict` they are errors.
+    pub fn load(&self, strict: bool) -> anyhow::Result<Decoder> {
+        let mut sources = Vec::new();
+        for DatabasePath { channel, path } in &self.databases {
+            let database = signals::load(path)?;
+            for warning in &database.warnings {
+                eprintln!("cantap: {}: {warning}", database.file);
+            }
+            if strict && !database.warnings.is_empty() {
+                bail!("{} has faults; see above", database.file);
+            }
+            sources.push(Source { channel: *channel, database });
+        }
+        let mut decoder = Decoder::new(sources);
+        if self.j1939 {
+            decoder.assume_j1939();
+        }
+        Ok(decoder)
+    }
+
+    /// As [`Self::load`], for commands that are useless without a database.
+    pub fn load_some(&self, strict: bool, patterns: &[String]) -> anyhow::Result<Decoder> {
+        let mut decoder = self.load(strict)?;
+        decoder.select(&Selection::new(patterns)?).context("--signal")?;
+        Ok(decoder)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_number_before_a_colon_is_a_channel() {
+        let parse = |text: &str| text.parse::<DatabasePath>().map(|path| (path.channel, path.path));
+        assert_eq!(parse("2:car.dbc"), Ok((Some(2), "car.dbc".into())));
+        assert_eq!(parse("car.dbc"), Ok((None, "car.dbc".into())));
+        assert_eq!(parse(r"C:\car.dbc"), Ok((None, r"C:\car.dbc".into())));
+        for wrong in ["0:car.dbc", "256:car.dbc", "1:"] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -228,13 +228,23 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Second half of closing: the channel has left the bus. Records the rest and returns true; or
-    /// false if the queue has no room for it yet.
-    pub fn finish_close(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) -> bool {
+    /// false if the queue has no room for it yet, or a mailbox has not been reported given up. With `overdue`
+    /// mailboxes are waited for no longer.
+    pub fn finish_close(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        overdue: bool,
+    ) -> bool {
         let entered = clock.now();
         self.on_receive(channel, traffic, clock, entered);
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+        if overdue {
+            state.transmitter.give_up_mailboxes(&mut self.recorder, now, state.abort_reason);
+        }
         state.errors.flush(&mut self.recorder, now);
         self.recorder.flush_losses(now);
         if !state.transmitter.is_idle() || !self.recorder.event(&Event::Stopped { channel }, now) {

@@ -197,7 +197,8 @@ impl Commands {
                 }
                 board
                     .with_capture(|capture, traffic, clock| {
-                        capture.finish_close(channel, &mut traffic[channel.index()], clock)
+                        let overdue = waited > STOP_WITHIN_TICKS;
+                        capture.finish_close(channel, &mut traffic[channel.index()], clock, overdue)
                     })
                     .then_some(Ok(Reply::Done))
             }

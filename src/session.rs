@@ -265,11 +265,14 @@ impl<'q, const N: usize> Session<'q, N> {
     }
 }
 
-/// Writes a response, encoded, to `out` and returns its length.
+/// Writes a response, encoded, to `out` and returns its length. A zero goes first: a packet of the last
+/// session may still have been in the endpoint when this one began, and the zero ends what it left unfinished.
 fn encode_response(response: Response, out: &mut [u8]) -> usize {
+    let Some((end, out)) = out.split_first_mut() else { return 0 };
+    *end = 0;
     let mut message = [0; MAX_RESPONSE + CRC_LEN];
     let written = postcard::to_slice(&DeviceMessage::Response(response), &mut message[..MAX_RESPONSE]);
     // Cannot fail: every response is shorter (tested).
     let len = written.map_or(0, |written| written.len());
-    seal(&mut message, len, out).unwrap_or(0)
+    1 + seal(&mut message, len, out).unwrap_or(0)
 }

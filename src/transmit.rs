@@ -179,6 +179,22 @@ impl Transmitter {
         }
     }
 
+    /// The controller is off the bus and reports its mailboxes no more: records them with `reason`.
+    pub fn give_up_mailboxes<const N: usize>(
+        &mut self,
+        recorder: &mut Recorder<'_, N>,
+        now: u64,
+        reason: TransmitFailure,
+    ) {
+        for place in &mut self.mailboxes {
+            let Some((tag, _)) = *place else { continue };
+            if recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
+                self.failed = self.failed.wrapping_add(1);
+                *place = None;
+            }
+        }
+    }
+
     /// Forgets the periodic entries and the replies.
     pub fn clear_entries(&mut self) {
         self.periodic = [const { None }; PERIODIC_SLOTS];

@@ -216,3 +216,32 @@ fn opening_and_closing_one_channel_leaves_the_other_alone() {
     assert!(bench.board.filters.written.is_empty());
     assert_eq!(bench.events(), [Event::Stopped { channel: CAN1 }, Event::Started { channel: CAN1 }]);
 }
+
+/// A packet of the last session may still be in the endpoint when the next one begins.
+#[test]
+fn a_response_is_readable_behind_an_unfinished_message() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.port.from_device.extend([5, 1, 2, 3]);
+    bench.greet();
+    assert_eq!(bench.complaints, ["Corrupt(Framing(Cobs))"]);
+}
+
+/// A mailbox that is never reported must not keep the channel from closing.
+#[test]
+fn a_channel_closes_though_a_mailbox_stays_silent() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let frames = [TxFrame { tag: 1, frame: numbered(1), at_ticks: None }].into_iter().collect();
+    bench.ask(Command::Send { channel: CAN1, frames }).unwrap();
+    // The controller forgets it.
+    bench.board.traffic[0].order.clear();
+    assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
+    bench.millisecond();
+    bench.millisecond();
+    let reason = cantap_wire::record::TransmitFailure::Closed;
+    assert_eq!(
+        bench.events(),
+        [Event::TransmitFailed { channel: CAN1, tag: 1, reason }, Event::Stopped { channel: CAN1 }]
+    );
+}

@@ -5,6 +5,11 @@
 //! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
 //! here looks at the host's clock, so the same seed gives the same run, byte for byte.
 
+pub mod bus;
+pub mod can;
+pub mod cpu;
+pub mod elf;
+pub mod memory_map;
 pub mod otg;
 pub mod peripheral;
 pub mod usb;

@@ -1,0 +1,511 @@
+//! One bxCAN controller: its modes, registers and interrupts.
+
+use cantap_wire::Frame;
+use cantap_wire::record::BusErrorKind;
+
+use super::fault::Counters;
+use super::fifo::Fifo;
+use super::filter::Match;
+use super::mailbox::{Attempt, Mailboxes};
+use crate::bus::bits::{FrameBits, INTERMISSION};
+
+mod mcr {
+    pub const INRQ: u32 = 1;
+    pub const SLEEP: u32 = 1 << 1;
+    pub const TXFP: u32 = 1 << 2;
+    pub const RFLM: u32 = 1 << 3;
+    pub const NART: u32 = 1 << 4;
+    pub const AWUM: u32 = 1 << 5;
+    pub const ABOM: u32 = 1 << 6;
+    pub const RESET: u32 = 1 << 15;
+    pub const DBF: u32 = 1 << 16;
+    pub const WRITABLE: u32 = DBF | 0xFF;
+}
+
+mod msr {
+    pub const INAK: u32 = 1;
+    pub const SLAK: u32 = 1 << 1;
+    pub const ERRI: u32 = 1 << 2;
+    pub const WKUI: u32 = 1 << 3;
+    pub const SLAKI: u32 = 1 << 4;
+    pub const TXM: u32 = 1 << 8;
+    pub const RXM: u32 = 1 << 9;
+    /// The receive pin: recessive.
+    pub const RX: u32 = 1 << 11 | 1 << 10;
+}
+
+mod ier {
+    pub const TMEIE: u32 = 1;
+    /// FMPIE0, FFIE0, FOVIE0; those of FIFO 1 are three bits up.
+    pub const FIFO0: u32 = 1;
+    pub const EWGIE: u32 = 1 << 8;
+    pub const EPVIE: u32 = 1 << 9;
+    pub const BOFIE: u32 = 1 << 10;
+    pub const LECIE: u32 = 1 << 11;
+    pub const ERRIE: u32 = 1 << 15;
+    pub const WKUIE: u32 = 1 << 16;
+    pub const SLKIE: u32 = 1 << 17;
+    pub const WRITABLE: u32 = 0x3_8F7F;
+}
+
+mod btr {
+    pub const LBKM: u32 = 1 << 30;
+    pub const SILM: u32 = 1 << 31;
+    pub const WRITABLE: u32 = 0xC37F_03FF;
+    /// One clock per quantum, 4 + 3 quanta of segments, jump width 2.
+    pub const RESET: u32 = 0x0123_0000;
+}
+
+/// Sequences of eleven recessive bits that a controller waits for in bus-off.
+const RECOVERY_SEQUENCES: u32 = 128;
+
+/// Where the controller stands in its handshakes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Mode {
+    /// Low power; the state after reset.
+    Sleep,
+    /// Set-up; nothing is sent or received.
+    Initialisation,
+    /// Asked to take part, waiting for eleven recessive bits since this cycle.
+    Synchronising {
+        /// When it was asked.
+        since: u64,
+    },
+    /// Takes part.
+    Normal,
+    /// Off the bus, waiting for this many sequences of eleven recessive bits; for none if software
+    /// has to start the recovery.
+    BusOff {
+        /// Sequences still to come.
+        left: Option<u32>,
+    },
+}
+
+/// A controller's bit timing in core cycles and quanta.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Timing {
+    /// Core cycles of a quantum.
+    pub quantum: u64,
+    /// Quanta of the propagation and first phase segment.
+    pub segment1: u64,
+    /// Quanta of the second phase segment.
+    pub segment2: u64,
+    /// Quanta by which a resynchronisation may move a bit.
+    pub jump: u64,
+}
+
+impl Timing {
+    /// Core cycles of a bit.
+    pub fn bit(&self) -> u64 {
+        self.quantum * (1 + self.segment1 + self.segment2)
+    }
+}
+
+/// One controller.
+#[derive(Clone, Debug)]
+pub struct Controller {
+    mode: Mode,
+    /// Initialisation was asked for while a frame is under way.
+    init_pending: bool,
+    mcr: u32,
+    msr_flags: u32,
+    ier: u32,
+    btr: u32,
+    last_error: u32,
+    counters: Counters,
+    mailboxes: Mailboxes,
+    fifos: [Fifo; 2],
+    /// The mailbox on the bus.
+    sending: Option<usize>,
+    receiving: bool,
+    /// In loop-back mode: when the mailbox under way is done.
+    loopback_end: Option<u64>,
+    loopback_from: u64,
+    cycles_per_clock: u64,
+    dominant_bits: u64,
+}
+
+impl Default for Controller {
+    fn default() -> Self {
+        Self {
+            mode: Mode::Sleep,
+            init_pending: false,
+            mcr: mcr::SLEEP | mcr::DBF,
+            msr_flags: 0,
+            ier: 0,
+            btr: btr::RESET,
+            last_error: 0,
+            counters: Counters::default(),
+            mailboxes: Mailboxes::default(),
+            fifos: Default::default(),
+            sending: None,
+            receiving: false,
+            loopback_end: None,
+            loopback_from: 0,
+            cycles_per_clock: 1,
+            dominant_bits: 0,
+        }
+    }
+}
+
+/// What firmware does.
+impl Controller {
+    /// Reads a register of this controller; `None` where there is none.
+    pub(super) fn read(&self, offset: u32) -> Option<u32> {
+        Some(match offset {
+            0x00 => self.mcr,
+            0x04 => self.msr(),
+            0x08 => self.mailboxes.status(self.mcr & mcr::TXFP != 0),
+            0x0C => self.fifos[0].status(),
+            0x10 => self.fifos[1].status(),
+            0x14 => self.ier,
+            0x18 => self.esr(),
+            0x1C => self.btr,
+            0x180..0x1B0 => {
+                let (n, register) = place(offset - 0x180);
+                self.mailboxes.read(n, register)
+            }
+            0x1B0..0x1D0 => {
+                let (n, register) = place(offset - 0x1B0);
+                self.fifos[n].mailbox(register as u32)
+            }
+            _ => return None,
+        })
+    }
+
+    /// Writes a register; `None` where there is none, or where the hardware would not take it.
+    pub(super) fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
+        match offset {
+            0x00 => self.write_mcr(value, now),
+            0x04 => self.msr_flags &= !(value & (msr::ERRI | msr::WKUI | msr::SLAKI)),
+            0x08 => self.mailboxes.control(value),
+            0x0C => self.fifos[0].control(value),
+            0x10 => self.fifos[1].control(value),
+            0x14 => self.ier = value & ier::WRITABLE,
+            0x18 => self.last_error = value >> 4 & 7,
+            // The bit timing can only be set in initialisation mode.
+            0x1C if self.mode == Mode::Initialisation => self.btr = value & btr::WRITABLE,
+            0x180..0x1B0 => {
+                let (n, register) = place(offset - 0x180);
+                self.loopback_from = self.loopback_from.max(now);
+                self.mailboxes.write(n, register, value)?;
+            }
+            _ => return None,
+        }
+        Some(())
+    }
+
+    fn write_mcr(&mut self, value: u32, now: u64) {
+        if value & mcr::RESET != 0 {
+            *self = self.after_reset();
+            return;
+        }
+        self.mcr = value & mcr::WRITABLE;
+        let (init, sleep) = (value & mcr::INRQ != 0, value & mcr::SLEEP != 0);
+        let busy = self.sending.is_some() || self.receiving;
+        match self.mode {
+            Mode::Initialisation if !init && sleep => self.fall_asleep(),
+            Mode::Initialisation if !init => self.leave_initialisation(now),
+            Mode::Initialisation => {}
+            // A frame under way is completed first.
+            _ if init && busy => self.init_pending = true,
+            _ if init => self.mode = Mode::Initialisation,
+            Mode::Sleep if !sleep => self.mode = Mode::Synchronising { since: now },
+            Mode::Normal | Mode::Synchronising { .. } if sleep && !busy => self.fall_asleep(),
+            _ => {}
+        }
+    }
+
+    fn fall_asleep(&mut self) {
+        self.mode = Mode::Sleep;
+        if self.ier & ier::SLKIE != 0 {
+            self.msr_flags |= msr::SLAKI;
+        }
+    }
+
+    fn leave_initialisation(&mut self, now: u64) {
+        self.mode = if self.counters.bus_off() {
+            Mode::BusOff { left: Some(RECOVERY_SEQUENCES) }
+        } else {
+            Mode::Synchronising { since: now }
+        };
+        if self.loops_back() {
+            // Nothing comes in from the pin: the bus is always recessive for it.
+            self.mode = Mode::Normal;
+            self.loopback_from = now + 11 * self.timing().bit();
+        }
+    }
+
+    fn msr(&self) -> u32 {
+        let mode = match self.mode {
+            Mode::Sleep => msr::SLAK,
+            // The acknowledgement stands until the controller has synchronised.
+            Mode::Initialisation | Mode::Synchronising { .. } if self.mcr & mcr::SLEEP == 0 => msr::INAK,
+            _ => 0,
+        };
+        mode | self.msr_flags
+            | msr::RX
+            | if self.sending.is_some() { msr::TXM } else { 0 }
+            | if self.receiving { msr::RXM } else { 0 }
+    }
+
+    fn esr(&self) -> u32 {
+        u32::from(self.counters.warning())
+            | u32::from(self.counters.passive()) << 1
+            | u32::from(self.counters.bus_off()) << 2
+            | self.last_error << 4
+            | u32::from(self.counters.transmit()) << 16
+            | u32::from(self.counters.receive()) << 24
+    }
+
+    /// The interrupt lines: transmit, FIFO 0, FIFO 1, status change and error.
+    pub(super) fn irqs(&self) -> [bool; 4] {
+        let on = |bits: u32| self.ier & bits != 0;
+        let fifo = |n: usize| {
+            let at = ier::FIFO0 << (1 + 3 * n);
+            self.fifos[n].irq(on(at), on(at << 1), on(at << 2))
+        };
+        let flag = |bit: u32| self.msr_flags & bit != 0;
+        let change = on(ier::ERRIE) && flag(msr::ERRI)
+            || on(ier::WKUIE) && flag(msr::WKUI)
+            || on(ier::SLKIE) && flag(msr::SLAKI);
+        [on(ier::TMEIE) && self.mailboxes.irq(), fifo(0), fifo(1), change]
+    }
+
+    /// A controller as after a reset, with what does not belong to its registers kept.
+    pub(super) fn after_reset(&self) -> Self {
+        Self {
+            cycles_per_clock: self.cycles_per_clock,
+            dominant_bits: self.dominant_bits,
+            ..Self::default()
+        }
+    }
+}
+
+/// What the bus sees and does.
+impl Controller {
+    /// Where it stands.
+    pub fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Core cycles of a controller clock, which the clock tree decides.
+    pub fn set_cycles_per_clock(&mut self, cycles: u64) {
+        self.cycles_per_clock = cycles;
+    }
+
+    /// The bit timing that BTR says.
+    pub fn timing(&self) -> Timing {
+        let field = |at: u32, bits: u32| u64::from(self.btr >> at & ((1 << bits) - 1)) + 1;
+        Timing {
+            quantum: field(0, 10) * self.cycles_per_clock,
+            segment1: field(16, 4),
+            segment2: field(20, 3),
+            jump: field(24, 2),
+        }
+    }
+
+    /// Dominant bits that it has put on its transmit pin since power-on: frames, ACK slots, error flags.
+    pub fn dominant_bits(&self) -> u64 {
+        self.dominant_bits
+    }
+
+    /// Frames waiting in a receive FIFO (0 or 1): 0 to 3.
+    pub fn fifo_fill(&self, fifo: usize) -> usize {
+        self.fifos[fifo].fill()
+    }
+
+    /// Frames that both receive FIFOs lost to overruns since the controller's reset.
+    pub fn overruns(&self) -> u64 {
+        self.fifos.iter().map(Fifo::lost).sum()
+    }
+
+    /// The error counters.
+    pub fn counters(&self) -> Counters {
+        self.counters
+    }
+
+    /// Silent mode: never dominant, never a frame of its own.
+    pub fn silent(&self) -> bool {
+        self.btr & btr::SILM != 0
+    }
+
+    fn loops_back(&self) -> bool {
+        self.btr & btr::LBKM != 0
+    }
+
+    /// Whether it takes part in the bus, if only as a listener.
+    pub(crate) fn listens(&self) -> bool {
+        self.mode == Mode::Normal && !self.loops_back()
+    }
+
+    /// Whether it acknowledges, and flags errors with dominant bits.
+    pub(crate) fn answers(&self) -> bool {
+        self.listens() && !self.silent()
+    }
+
+    /// The frame it wants to send now.
+    pub(crate) fn next_frame(&self) -> Option<Frame> {
+        if !self.answers() || self.init_pending {
+            return None;
+        }
+        Some(self.mailboxes.next(self.mcr & mcr::TXFP != 0)?.1)
+    }
+
+    /// The bus is occupied: by its own frame if `own`.
+    pub(crate) fn start_of_frame(&mut self, own: bool, now: u64) {
+        match self.mode {
+            Mode::Normal if own => {
+                if let Some((n, _)) = self.mailboxes.next(self.mcr & mcr::TXFP != 0) {
+                    self.mailboxes.start(n);
+                    self.sending = Some(n);
+                }
+            }
+            Mode::Normal => self.receiving = true,
+            Mode::Sleep => {
+                self.msr_flags |= msr::WKUI;
+                if self.mcr & mcr::AWUM != 0 {
+                    self.mcr &= !mcr::SLEEP;
+                    self.mode = Mode::Synchronising { since: now };
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// It lost arbitration and goes on as a receiver.
+    pub(crate) fn lost_arbitration(&mut self) {
+        self.end_attempt(Attempt::LostArbitration);
+        self.receiving = true;
+    }
+
+    /// Its frame was sent.
+    pub(crate) fn sent(&mut self) {
+        self.counters.sent();
+        self.last_error = 0;
+        self.end_attempt(Attempt::Sent);
+    }
+
+    fn end_attempt(&mut self, attempt: Attempt) {
+        if let Some(n) = self.sending.take() {
+            self.mailboxes.finish(n, attempt, self.mcr & mcr::NART != 0);
+        }
+    }
+
+    /// A frame was received without error; `found` says whether and where the filters want it.
+    pub(super) fn received(&mut self, frame: &Frame, found: Option<Match>) {
+        self.counters.received();
+        self.last_error = 0;
+        if let Some(Match { fifo, index }) = found {
+            self.fifos[fifo].put(*frame, index, self.mcr & mcr::RFLM != 0);
+        }
+    }
+
+    /// Its own frame failed.
+    pub(crate) fn transmit_error(&mut self, kind: BusErrorKind, flag_seen: bool) {
+        self.note(kind, |counters| counters.transmit_error(kind, flag_seen));
+        self.end_attempt(Attempt::Failed);
+    }
+
+    /// A frame it received failed; `first` as in [`Counters::receive_error`].
+    pub(crate) fn receive_error(&mut self, kind: BusErrorKind, first: bool) {
+        self.note(kind, |counters| counters.receive_error(first));
+    }
+
+    fn note(&mut self, kind: BusErrorKind, count: impl FnOnce(&mut Counters)) {
+        let before = self.counters;
+        count(&mut self.counters);
+        let after = self.counters;
+        self.last_error = match kind {
+            BusErrorKind::Stuff => 1,
+            BusErrorKind::Form => 2,
+            BusErrorKind::Acknowledgment => 3,
+            BusErrorKind::BitRecessive => 4,
+            BusErrorKind::BitDominant => 5,
+            BusErrorKind::Crc => 6,
+        };
+        let news = [
+            (ier::LECIE, true),
+            (ier::EWGIE, after.warning() && !before.warning()),
+            (ier::EPVIE, after.passive() && !before.passive()),
+            (ier::BOFIE, after.bus_off() && !before.bus_off()),
+        ];
+        if news.iter().any(|(enable, happened)| *happened && self.ier & enable != 0) {
+            self.msr_flags |= msr::ERRI;
+        }
+        if after.bus_off() {
+            let automatic = self.mcr & mcr::ABOM != 0;
+            self.mode = Mode::BusOff { left: automatic.then_some(RECOVERY_SEQUENCES) };
+        }
+    }
+
+    /// It put this many dominant bits on the bus.
+    pub(crate) fn drove(&mut self, dominant_bits: u64) {
+        self.dominant_bits += dominant_bits;
+    }
+
+    /// The frame or error frame is over.
+    pub(crate) fn bus_free(&mut self) {
+        self.receiving = false;
+        if self.init_pending {
+            self.init_pending = false;
+            self.mode = Mode::Initialisation;
+        }
+    }
+
+    /// Eleven recessive bits since it asked.
+    pub(crate) fn synchronised(&mut self) {
+        if matches!(self.mode, Mode::Synchronising { .. }) {
+            self.mode = Mode::Normal;
+        }
+    }
+
+    /// `sequences` of eleven recessive bits have passed in bus-off.
+    pub(crate) fn recover(&mut self, sequences: u32) {
+        if let Mode::BusOff { left: Some(left) } = &mut self.mode {
+            *left = left.saturating_sub(sequences);
+            if *left == 0 {
+                self.mode = Mode::Normal;
+                self.counters = Counters::default();
+            }
+        }
+    }
+
+    /// When the loop-back transmission under way is done, or the next may begin.
+    pub(super) fn loopback_event(&self) -> Option<u64> {
+        if self.mode != Mode::Normal || !self.loops_back() {
+            return None;
+        }
+        self.loopback_end.or_else(|| {
+            self.mailboxes.next(self.mcr & mcr::TXFP != 0)?;
+            Some(self.loopback_from)
+        })
+    }
+
+    /// Sends to itself until `now`; returns a frame that came back.
+    pub(super) fn advance_loopback(&mut self, now: u64) -> Option<Frame> {
+        while self.loopback_event().is_some_and(|due| due <= now) {
+            let by_request = self.mcr & mcr::TXFP != 0;
+            if let Some(end) = self.loopback_end.take() {
+                self.loopback_from = end + INTERMISSION as u64 * self.timing().bit();
+                let frame = self.sending.map(|n| self.mailboxes.frame_in(n));
+                self.sent();
+                return frame;
+            }
+            let (n, frame) = self.mailboxes.next(by_request)?;
+            let bits = FrameBits::new(&frame);
+            self.mailboxes.start(n);
+            self.sending = Some(n);
+            self.loopback_end = Some(self.loopback_from + bits.len() as u64 * self.timing().bit());
+            if !self.silent() {
+                self.dominant_bits += bits.dominant_in(bits.len());
+            }
+        }
+        None
+    }
+}
+
+/// Which mailbox and which of its four registers an offset names.
+fn place(offset: u32) -> (usize, usize) {
+    ((offset / 0x10) as usize, (offset / 4 % 4) as usize)
+}

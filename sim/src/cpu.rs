@@ -272,8 +272,7 @@ impl Cpu {
     /// A system reset: registers and interrupt controller as after power-on; memories and time stay.
     pub fn reset(&mut self) {
         self.core.with_sys(|sys| {
-            let (cpuid, bits, regions, mvfr) =
-                (sys.cpuid, sys.priority_bits, sys.mpu_regions, sys.mvfr);
+            let (cpuid, bits, regions, mvfr) = (sys.cpuid, sys.priority_bits, sys.mpu_regions, sys.mvfr);
             *sys = rsemu::cpu::arm::v7m::sys::Sys::new(cpuid, bits, regions).with_fp(mvfr);
         });
         self.core.request_reset();
@@ -310,8 +309,7 @@ impl Cpu {
     pub fn step(&mut self) -> u64 {
         self.clock.store(self.now, Ordering::Relaxed);
         let before = self.state;
-        let cycles =
-            if before.in_it_block() { self.step_in_it_block(before) } else { self.core.step() };
+        let cycles = if before.in_it_block() { self.step_in_it_block(before) } else { self.core.step() };
         self.now += cycles;
         self.state = self.core.regs().into();
         if cycles == 1 && self.state.pc() == before.pc() {
@@ -324,8 +322,8 @@ impl Cpu {
     /// unconditionally afterwards: exceptions wait until the block's end, at most four instructions.
     /// And an exception return that is itself in a block leaves ITSTATE advanced once too often.
     fn step_in_it_block(&mut self, before: State) -> u64 {
-        let could_be_taken = self.lines != 0
-            || self.core.with_sys(|sys| sys.pending.iter().any(|word| *word != 0));
+        let could_be_taken =
+            self.lines != 0 || self.core.with_sys(|sys| sys.pending.iter().any(|word| *word != 0));
         if !could_be_taken || before.primask {
             let cycles = self.core.step();
             self.mend_conditional_return(before);

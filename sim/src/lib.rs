@@ -9,13 +9,22 @@ pub mod bus;
 pub mod can;
 pub mod cpu;
 pub mod elf;
+pub mod machine;
 pub mod memory_map;
 pub mod otg;
 pub mod peripheral;
+pub mod probe;
+pub mod soc;
+pub mod stop;
+pub mod trace;
+pub mod traffic;
 pub mod usb;
 pub mod usb_host;
 
+pub use elf::{ElfError, Image};
+pub use machine::{Machine, Setup};
 pub use peripheral::Peripheral;
+pub use stop::{Reason, Stopped};
 
 /// Core cycles per emulated second: the firmware's SYSCLK of 144 MHz. The few microseconds before the
 /// firmware switches to its PLL are counted in the same unit.

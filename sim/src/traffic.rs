@@ -63,9 +63,10 @@ impl Frames {
     pub fn new(kind: Kind, seed: u64) -> Self {
         let all_standard = || (0..=Id::MAX_STANDARD).map(Id::standard_truncated);
         let shortest = match kind {
-            Kind::Std0 => {
-                all_standard().filter_map(|id| Frame::data_frame(id, &[])).filter(|f| bus_bits(f) == 48).collect()
-            }
+            Kind::Std0 => all_standard()
+                .filter_map(|id| Frame::data_frame(id, &[]))
+                .filter(|f| bus_bits(f) == 48)
+                .collect(),
             Kind::Rtr => all_standard()
                 .flat_map(|id| (1..=8).filter_map(move |dlc| Frame::remote_frame(id, dlc)))
                 .filter(|frame| bus_bits(frame) == 47)
@@ -219,7 +220,8 @@ mod tests {
     fn traffic_keeps_its_load() {
         let bit = BitTime::of_rate(1_000_000);
         let mut traffic = Traffic::new(Kind::Mix, 3, 25.0, 0, CYCLES_PER_SECOND);
-        let bits: u32 = std::iter::from_fn(|| traffic.next_frame(bit)).map(|(_, frame)| bus_bits(&frame)).sum();
+        let bits: u32 =
+            std::iter::from_fn(|| traffic.next_frame(bit)).map(|(_, frame)| bus_bits(&frame)).sum();
         assert!((249_000..=251_000).contains(&bits), "{bits}");
     }
 

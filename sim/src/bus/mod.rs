@@ -205,9 +205,7 @@ impl Wire {
         let bit = controller.timing().bit();
         match controller.mode() {
             Mode::Synchronising { since } => Some(since.max(self.recessive) + SYNC_BITS * bit),
-            Mode::BusOff { left: Some(left) } => {
-                Some(self.recessive + u64::from(left) * SYNC_BITS * bit)
-            }
+            Mode::BusOff { left: Some(left) } => Some(self.recessive + u64::from(left) * SYNC_BITS * bit),
             _ => None,
         }
     }
@@ -303,10 +301,8 @@ impl Wire {
         members.extend(&twins);
         let senders = members.len();
         members.extend(collided.iter().map(|(member, _)| *member));
-        let receivers: Vec<Member> = self
-            .members()
-            .filter(|member| !members.contains(member) && self.listens(*member, can))
-            .collect();
+        let receivers: Vec<Member> =
+            self.members().filter(|member| !members.contains(member) && self.listens(*member, can)).collect();
         members.extend(&receivers);
         let participants: Vec<Participant> = members
             .iter()
@@ -414,7 +410,9 @@ impl Wire {
     }
 
     fn take_disturbance(&mut self) -> Option<Disturbance> {
-        self.disturbances.pop_front_if(|(frame, _)| *frame <= self.started).map(|(_, disturbance)| disturbance)
+        self.disturbances
+            .pop_front_if(|(frame, _)| *frame <= self.started)
+            .map(|(_, disturbance)| disturbance)
     }
 
     /// Adds what each emulated controller puts on the bus in this frame.

@@ -274,11 +274,7 @@ impl Controller {
 
     /// A controller as after a reset, with what does not belong to its registers kept.
     pub(super) fn after_reset(&self) -> Self {
-        Self {
-            cycles_per_clock: self.cycles_per_clock,
-            dominant_bits: self.dominant_bits,
-            ..Self::default()
-        }
+        Self { cycles_per_clock: self.cycles_per_clock, dominant_bits: self.dominant_bits, ..Self::default() }
     }
 }
 

@@ -72,8 +72,7 @@ impl Counters {
 
     /// A frame was received.
     pub fn received(&mut self) {
-        self.receive =
-            if self.receive > PASSIVE { AFTER_GOOD_FRAME } else { self.receive.saturating_sub(1) };
+        self.receive = if self.receive > PASSIVE { AFTER_GOOD_FRAME } else { self.receive.saturating_sub(1) };
     }
 }
 

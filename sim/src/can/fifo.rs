@@ -61,9 +61,7 @@ impl Fifo {
 
     /// RFxR.
     pub fn status(&self) -> u32 {
-        self.entries.len() as u32
-            | if self.full { FULL } else { 0 }
-            | if self.overrun { OVERRUN } else { 0 }
+        self.entries.len() as u32 | if self.full { FULL } else { 0 } | if self.overrun { OVERRUN } else { 0 }
     }
 
     /// A write to RFxR: releases the oldest frame, clears flags.
@@ -136,7 +134,9 @@ mod tests {
         let mut fifo = fill(true);
         drain(&mut fifo);
         assert_eq!(fifo.status(), FULL | OVERRUN);
-        assert!(fifo.irq(false, true, false) && fifo.irq(false, false, true) && !fifo.irq(true, false, false));
+        assert!(
+            fifo.irq(false, true, false) && fifo.irq(false, false, true) && !fifo.irq(true, false, false)
+        );
         fifo.control(OVERRUN);
         assert_eq!(fifo.status(), FULL);
         fifo.control(FULL);

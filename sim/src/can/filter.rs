@@ -100,10 +100,9 @@ impl Filters {
             let hits: &[bool] = match (wide, list) {
                 (true, false) => &[differs(first) & second == 0],
                 (true, true) => &[differs(first) == 0, differs(second) == 0],
-                (false, false) => &[
-                    differs_short(halves[0]) & halves[1] == 0,
-                    differs_short(halves[2]) & halves[3] == 0,
-                ],
+                (false, false) => {
+                    &[differs_short(halves[0]) & halves[1] == 0, differs_short(halves[2]) & halves[3] == 0]
+                }
                 (false, true) => &halves.map(|half| differs_short(half) == 0),
             };
             // Inactive banks are numbered too.
@@ -233,10 +232,8 @@ mod tests {
 
     #[test]
     fn the_banks_are_divided_between_the_controllers() {
-        let filters = filters(&[
-            (13, true, true, false, [std(1), std(1)]),
-            (14, true, true, false, [std(2), std(2)]),
-        ]);
+        let filters =
+            filters(&[(13, true, true, false, [std(1), std(1)]), (14, true, true, false, [std(2), std(2)])]);
         // Bank 13 is CAN1's fourteenth; the inactive ones before it hold two 16-bit masks each.
         assert_eq!(filters.accept(0, std(1)), found(0, 26));
         assert_eq!(filters.accept(0, std(2)), None);

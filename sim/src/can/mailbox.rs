@@ -61,11 +61,7 @@ impl Mailbox {
         let (base, low) = (u64::from(id >> 21), u64::from(id >> 3 & 0x3_FFFF));
         let (extended, remote) = (u64::from(id >> 2 & 1), u64::from(id >> 1 & 1));
         // Base ID, then RTR or SRR, then IDE, then the rest of an extended ID and its RTR.
-        if extended == 1 {
-            base << 21 | 0b11 << 19 | low << 1 | remote
-        } else {
-            base << 21 | remote << 20
-        }
+        if extended == 1 { base << 21 | 0b11 << 19 | low << 1 | remote } else { base << 21 | remote << 20 }
     }
 
     fn complete(&mut self, status: u32) {

@@ -16,7 +16,6 @@ use cantap_wire::Frame;
 pub use controller::{Controller, Mode, Timing};
 use filter::Filters;
 
-
 /// Registers of CAN2 begin this far above CAN1's.
 const CAN2: u32 = 0x400;
 /// Filter registers, in CAN1 only.

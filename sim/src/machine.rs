@@ -1,0 +1,338 @@
+//! The machine: core, chip and buses in one time.
+
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crate::Peripheral;
+use crate::bus::Wire;
+use crate::cpu::{Bus, Cpu, Memories, State};
+use crate::elf::Image;
+use crate::memory_map as map;
+use crate::probe::{Change, Probe};
+use crate::soc::rcc::ResetCause;
+use crate::soc::{Board, CAN_IRQS, SharedBoard};
+use crate::stop::{Reason, Stopped};
+use crate::trace::Trace;
+
+/// How often, in steps, what the core does not report is looked at: a reset request, a lock-up.
+const LOOK_EVERY: u32 = 1024;
+const HARD_FAULT: u16 = 3;
+/// The receive interrupts, whose masking is measured.
+const CAPTURE_LINES: u128 =
+    1 << CAN_IRQS[0][1] | 1 << CAN_IRQS[0][2] | 1 << CAN_IRQS[1][1] | 1 << CAN_IRQS[1][2];
+/// Functions in which a panic is seen to begin.
+const PANIC_FUNCTIONS: [&str; 4] =
+    ["rust_begin_unwind", "__rustc::rust_begin_unwind", "core::panicking::panic_fmt", "panic_handler"];
+
+/// How a machine is set up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Setup {
+    /// The board's crystal in Hz.
+    pub hse_hz: u64,
+    /// Both controllers on one bus.
+    pub joined: bool,
+    /// A reset that the firmware asks for ends the run, rather than restarting it.
+    pub stop_on_reset: bool,
+    /// A watchdog reset restarts the firmware, rather than ending the run.
+    pub survive_watchdog: bool,
+}
+
+impl Default for Setup {
+    /// The Olimex STM32-P405's crystal, two buses, restart on request, end on a watchdog reset.
+    fn default() -> Self {
+        Self { hse_hz: 8_000_000, joined: false, stop_on_reset: false, survive_watchdog: false }
+    }
+}
+
+/// An emulated board with its firmware.
+pub struct Machine {
+    cpu: Cpu,
+    board: Arc<Mutex<Board>>,
+    image: Image,
+    setup: Setup,
+    probe: Probe,
+    trace: Option<Trace>,
+    panics: Vec<u32>,
+    held_lines: u128,
+    lines: u128,
+    next_event: u64,
+    stalled_until: u64,
+    look_in: u32,
+    resets: u64,
+    /// The capture interrupts' priority, looked up when BASEPRI is first seen set.
+    capture_priority: Option<u8>,
+}
+
+impl Machine {
+    /// A machine at power-on, with `image` in flash.
+    pub fn new(image: Image, setup: Setup) -> Self {
+        let memories = Memories::new();
+        for (address, bytes) in image.segments() {
+            memories.flash.write(address, bytes);
+        }
+        let mut board = Board::new(&memories, setup.hse_hz);
+        if setup.joined {
+            board.wires = [Wire::new(&[0, 1]), Wire::new(&[])];
+        }
+        let board = Arc::new(Mutex::new(board));
+        let bus: Arc<dyn Bus> = Arc::new(SharedBoard(Arc::clone(&board)));
+        let cpu = Cpu::new(memories, &bus);
+        let panics = PANIC_FUNCTIONS.iter().filter_map(|name| image.address_of(name)).collect();
+        Self {
+            cpu,
+            board,
+            image,
+            setup,
+            probe: Probe::default(),
+            trace: None,
+            panics,
+            held_lines: 0,
+            lines: 0,
+            next_event: 0,
+            stalled_until: 0,
+            look_in: LOOK_EVERY,
+            resets: 0,
+            capture_priority: None,
+        }
+    }
+
+    /// The chip and what is wired to it. Not to be held across [`Self::run_until`].
+    pub fn board(&self) -> MutexGuard<'_, Board> {
+        lock(&self.board)
+    }
+
+    /// Puts a device at a range of addresses (`memory_map::OTG_FS`, for example), with its interrupt.
+    pub fn attach(
+        &mut self,
+        range: std::ops::Range<u32>,
+        irq: u16,
+        device: Arc<Mutex<dyn Peripheral + Send>>,
+    ) {
+        self.board().attach(range, irq, device);
+    }
+
+    /// Core cycles since power-on.
+    pub fn now(&self) -> u64 {
+        self.cpu.now()
+    }
+
+    /// The core and its memories.
+    pub fn cpu(&self) -> &Cpu {
+        &self.cpu
+    }
+
+    /// The firmware.
+    pub fn image(&self) -> &Image {
+        &self.image
+    }
+
+    /// What the run cost so far.
+    pub fn probe(&self) -> &Probe {
+        &self.probe
+    }
+
+    /// Starts counting anew.
+    pub fn reset_probe(&mut self) {
+        self.probe.reset(self.cpu.now());
+        self.capture_priority = None;
+    }
+
+    /// System resets so far, power-on not counted.
+    pub fn resets(&self) -> u64 {
+        self.resets
+    }
+
+    /// Keeps interrupt lines (bit n is interrupt n) from reaching the core, as a firmware that masks them
+    /// for too long would. 0 lets all through again.
+    pub fn hold_lines(&mut self, lines: u128) {
+        self.held_lines = lines;
+    }
+
+    /// Records what happens from now on.
+    pub fn start_trace(&mut self) {
+        let mut trace = Trace::default();
+        for (n, wire) in self.board().wires.iter().enumerate() {
+            trace.skip(n, wire.history());
+        }
+        self.trace = Some(trace);
+    }
+
+    /// Ends recording and returns it.
+    pub fn take_trace(&mut self) -> Option<Trace> {
+        self.trace.take()
+    }
+
+    /// An exception's name: its handler's, where the vector table and the symbols tell it.
+    pub fn exception_name(&self, number: u16) -> String {
+        let handler = self.cpu.word(map::FLASH.start + 4 * u32::from(number)).unwrap_or(0) & !1;
+        match self.image.function_at(handler) {
+            Some((name, 0)) if !name.contains("DefaultHandler") => name.to_owned(),
+            _ if number >= 16 => format!("interrupt {}", number - 16),
+            _ => format!("exception {number}"),
+        }
+    }
+
+    /// Runs until core cycle `until`, or a few beyond: an instruction is never cut.
+    pub fn run_until(&mut self, until: u64) -> Result<(), Stopped> {
+        self.refresh();
+        while self.cpu.now() < until {
+            if self.cpu.now() >= self.next_event {
+                self.service()?;
+            }
+            if self.cpu.now() < self.stalled_until {
+                let from = self.cpu.now();
+                self.cpu.advance_idle(self.next_event.min(self.stalled_until).min(until));
+                self.probe.stood_still(self.cpu.now() - from);
+                if let Some(trace) = &mut self.trace {
+                    trace.stalled(from, self.cpu.now());
+                }
+            } else if self.cpu.asleep() {
+                let from = self.cpu.now();
+                self.cpu.advance_idle(self.next_event.min(until));
+                self.probe.slept(self.cpu.now() - from);
+                if let Some(trace) = &mut self.trace {
+                    trace.slept(from, self.cpu.now());
+                }
+            } else {
+                self.step()?;
+            }
+        }
+        self.refresh();
+        Ok(())
+    }
+
+    fn step(&mut self) -> Result<(), Stopped> {
+        let before = *self.cpu.state();
+        let cycles = self.cpu.step();
+        let after = *self.cpu.state();
+        let change = self.probe.step(&before, &after, cycles);
+        if let Some(change) = change {
+            self.exception_changed(change)?;
+        }
+        self.follow_masks(&after);
+        if self.cpu.take_touched() {
+            self.refresh();
+        }
+        if self.panics.contains(&after.pc()) {
+            return Err(self.stopped(Reason::Panic));
+        }
+        self.look_in -= 1;
+        if self.look_in == 0 {
+            self.look()?;
+        }
+        Ok(())
+    }
+
+    fn exception_changed(&mut self, change: Change) -> Result<(), Stopped> {
+        let now = self.cpu.now();
+        if let Some(trace) = &mut self.trace {
+            match change {
+                Change::Enter(exception) => trace.enter(exception, now),
+                Change::Leave(exception) => trace.leave(exception, now),
+                Change::Chain(ended, entered) => {
+                    trace.leave(ended, now);
+                    trace.enter(entered, now);
+                }
+            }
+        }
+        match change {
+            Change::Enter(HARD_FAULT) | Change::Chain(_, HARD_FAULT) => {
+                Err(self.stopped(Reason::HardFault(self.cpu.fault_status())))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// Measures how long the capture interrupt is kept waiting by PRIMASK, FAULTMASK or BASEPRI.
+    fn follow_masks(&mut self, state: &State) {
+        let masked = state.primask
+            || state.faultmask
+            || state.basepri != 0 && state.basepri <= self.capture_priority();
+        if masked == self.probe.in_window() {
+            return;
+        }
+        let waits = self.lines & CAPTURE_LINES != 0;
+        let window = self.probe.masked(masked, waits, self.cpu.now(), state.pc());
+        if let (Some(window), Some(trace)) = (window, &mut self.trace) {
+            trace.masked(window.start, window.start + window.cycles);
+        }
+    }
+
+    fn capture_priority(&mut self) -> u8 {
+        let cpu = &self.cpu;
+        *self.capture_priority.get_or_insert_with(|| cpu.priority_of(CAN_IRQS[0][1]))
+    }
+
+    /// What the core does not report by itself.
+    fn look(&mut self) -> Result<(), Stopped> {
+        self.look_in = LOOK_EVERY;
+        if self.cpu.locked_up() {
+            return Err(self.stopped(Reason::LockUp));
+        }
+        if map::SYSTEM_MEMORY.contains(&self.cpu.state().pc()) {
+            return Err(self.stopped(Reason::Bootloader));
+        }
+        if self.cpu.reset_requested() {
+            if self.setup.stop_on_reset {
+                return Err(self.stopped(Reason::Reset));
+            }
+            self.restart(ResetCause::Software);
+        }
+        Ok(())
+    }
+
+    fn service(&mut self) -> Result<(), Stopped> {
+        let now = self.cpu.now();
+        let deadline = {
+            let mut board = lock(&self.board);
+            board.advance(now);
+            board.watchdog_deadline()
+        };
+        if deadline.is_some_and(|deadline| deadline <= now) {
+            if !self.setup.survive_watchdog {
+                return Err(self.stopped(Reason::Watchdog));
+            }
+            self.restart(ResetCause::Watchdog);
+        }
+        self.look()?;
+        self.refresh();
+        Ok(())
+    }
+
+    fn restart(&mut self, cause: ResetCause) {
+        lock(&self.board).reset(cause, self.cpu.now());
+        self.cpu.reset();
+        self.capture_priority = None;
+        self.resets += 1;
+        self.refresh();
+    }
+
+    /// Asks everything for its interrupt line and its next event.
+    fn refresh(&mut self) {
+        let mut board = lock(&self.board);
+        self.lines = board.lines() & !self.held_lines;
+        self.next_event = board.next_event().unwrap_or(u64::MAX);
+        let stall = board.take_stall();
+        if stall > 0 {
+            self.stalled_until = self.cpu.now() + stall;
+        }
+        for n in 0..2 {
+            let fill = board.can.controllers[n].fifo_fill(0).max(board.can.controllers[n].fifo_fill(1));
+            self.probe.fifo(n, fill);
+            if let Some(trace) = &mut self.trace {
+                trace.fifo(n, fill, self.cpu.now());
+                trace.frames(n, board.wires[n].history());
+            }
+        }
+        drop(board);
+        self.cpu.set_lines(self.lines);
+    }
+
+    fn stopped(&self, reason: Reason) -> Stopped {
+        Stopped::here(reason, &self.cpu, &self.image)
+    }
+}
+
+/// A peer that panicked while it held the lock leaves a state that is as good as any other.
+fn lock(board: &Mutex<Board>) -> MutexGuard<'_, Board> {
+    board.lock().unwrap_or_else(PoisonError::into_inner)
+}

@@ -1,0 +1,200 @@
+//! The flash interface (RM0090 Rev 21 §3): key unlock, sector erase and programming, with the times they
+//! take (DS8626 Rev 10 Table 40, typical values), during which the core cannot fetch and so stands
+//! still.
+
+use std::ops::Range;
+
+use crate::CYCLES_PER_US;
+use crate::cpu::Memory;
+use crate::memory_map::FLASH;
+
+const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
+const PG: u32 = 1;
+const SER: u32 = 1 << 1;
+const MER: u32 = 1 << 2;
+const STRT: u32 = 1 << 16;
+const LOCK: u32 = 1 << 31;
+const EOP: u32 = 1;
+/// Programming errors: alignment, parallelism, sequence.
+const PGPERR: u32 = 1 << 6;
+const PGSERR: u32 = 1 << 7;
+const PROGRAM_US: u64 = 16;
+
+/// The sectors: four of 16 KiB, one of 64, seven of 128, with the time their erasure takes in ms.
+fn sector(number: u32) -> Option<(Range<u32>, u64)> {
+    let (offset, kib, ms) = match number {
+        0..=3 => (number * 16, 16, 250),
+        4 => (64, 64, 550),
+        5..=11 => (128 * (number - 4), 128, 1000),
+        _ => return None,
+    };
+    let start = FLASH.start + offset * 1024;
+    Some((start..start + kib * 1024, ms))
+}
+
+/// The register block, and the memory behind it.
+#[derive(Clone, Debug)]
+pub struct FlashInterface {
+    memory: Memory,
+    access: u32,
+    keys_given: usize,
+    status: u32,
+    control: u32,
+    options: u32,
+    /// Core cycles for which the core now stands still.
+    stall: u64,
+}
+
+impl FlashInterface {
+    /// Locked, as after reset.
+    pub fn new(memory: Memory) -> Self {
+        let options = 0x0FFF_AAED;
+        Self { memory, access: 0, keys_given: 0, status: 0, control: LOCK, options, stall: 0 }
+    }
+
+    /// The same memory after a reset.
+    #[must_use]
+    pub fn after_reset(&self) -> Self {
+        Self::new(self.memory.clone())
+    }
+
+    /// Reads a register; `None` where there is none.
+    pub fn read(&self, offset: u32) -> Option<u32> {
+        Some(match offset {
+            0x00 => self.access,
+            0x04 | 0x08 => 0,
+            0x0C => self.status,
+            0x10 => self.control,
+            0x14 => self.options,
+            _ => return None,
+        })
+    }
+
+    /// Writes a register; `None` where there is none.
+    pub fn write(&mut self, offset: u32, value: u32) -> Option<()> {
+        match offset {
+            0x00 => self.access = value,
+            0x04 => self.take_key(value),
+            0x08 => {}
+            0x0C => self.status &= !(value & 0xF3),
+            0x10 if self.control & LOCK != 0 => {}
+            0x10 => {
+                self.control = value & !STRT;
+                if value & STRT != 0 {
+                    self.erase();
+                }
+                if value & LOCK != 0 {
+                    self.keys_given = 0;
+                }
+            }
+            0x14 => self.options = value,
+            _ => return None,
+        }
+        Some(())
+    }
+
+    /// A wrong key locks the register until the next reset.
+    fn take_key(&mut self, key: u32) {
+        if KEYS.get(self.keys_given) == Some(&key) {
+            self.keys_given += 1;
+            if self.keys_given == KEYS.len() {
+                self.control &= !LOCK;
+            }
+        } else {
+            self.keys_given = usize::MAX;
+        }
+    }
+
+    fn erase(&mut self) {
+        let sectors = match self.control & (SER | MER) {
+            SER => (self.control >> 3 & 15)..(self.control >> 3 & 15) + 1,
+            MER => 0..12,
+            _ => {
+                self.status |= PGSERR;
+                return;
+            }
+        };
+        for number in sectors {
+            let Some((range, ms)) = sector(number) else {
+                self.status |= PGSERR;
+                return;
+            };
+            self.memory.write(range.start, &vec![0xFF; range.len()]);
+            self.stall += ms * 1000 * CYCLES_PER_US;
+        }
+        self.status |= EOP;
+    }
+
+    /// A store to flash: programs, if that was set up. Bits only go from 1 to 0.
+    pub fn program(&mut self, address: u32, size: u8, value: u32) {
+        let parallelism = 1 << (self.control >> 8 & 3);
+        if self.control & PG == 0 || self.control & LOCK != 0 {
+            self.status |= PGSERR;
+            return;
+        }
+        if u32::from(size) != parallelism {
+            self.status |= PGPERR;
+            return;
+        }
+        let mut bytes = [0; 4];
+        let bytes = &mut bytes[..size.into()];
+        self.memory.read(address, bytes);
+        for (byte, new) in bytes.iter_mut().zip(value.to_le_bytes()) {
+            *byte &= new;
+        }
+        self.memory.write(address, bytes);
+        self.stall += PROGRAM_US * CYCLES_PER_US;
+        self.status |= EOP;
+    }
+
+    /// Takes the core cycles for which the core is to stand still.
+    pub fn take_stall(&mut self) -> u64 {
+        std::mem::take(&mut self.stall)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cpu::Memories;
+
+    fn unlocked() -> (FlashInterface, Memory) {
+        let memory = Memories::new().flash;
+        let mut flash = FlashInterface::new(memory.clone());
+        for key in KEYS {
+            flash.write(0x04, key).unwrap();
+        }
+        assert_eq!(flash.read(0x10).unwrap() & LOCK, 0);
+        (flash, memory)
+    }
+
+    #[test]
+    fn a_word_is_programmed_and_its_sector_erased() {
+        let (mut flash, memory) = unlocked();
+        let address = 0x080E_0000;
+        flash.write(0x10, PG | 2 << 8).unwrap();
+        flash.program(address, 4, 0x1234_5678);
+        assert_eq!(memory.word(address), Some(0x1234_5678));
+        flash.program(address, 4, 0xFFFF_0000);
+        assert_eq!(memory.word(address), Some(0x1234_0000), "bits only fall");
+        flash.write(0x10, SER | 11 << 3 | STRT).unwrap();
+        assert_eq!(memory.word(address), Some(u32::MAX));
+        assert_eq!(flash.read(0x0C).unwrap(), EOP);
+        assert_eq!(flash.take_stall(), (2 * 16 + 1_000_000) * CYCLES_PER_US);
+    }
+
+    #[test]
+    fn nothing_is_programmed_while_locked() {
+        let memory = Memories::new().flash;
+        let mut flash = FlashInterface::new(memory.clone());
+        flash.write(0x10, PG | 2 << 8).unwrap();
+        flash.program(FLASH.start, 4, 0);
+        assert_eq!(memory.word(FLASH.start), Some(u32::MAX));
+        assert_ne!(flash.read(0x0C).unwrap() & PGSERR, 0);
+        flash.write(0x04, 1).unwrap();
+        for key in KEYS {
+            flash.write(0x04, key).unwrap();
+        }
+        assert_ne!(flash.read(0x10).unwrap() & LOCK, 0, "a wrong key locks until reset");
+    }
+}

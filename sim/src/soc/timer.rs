@@ -1,0 +1,281 @@
+//! General-purpose and basic timers, counting up (RM0090 Rev 21 §18, §20): prescaler, auto-reload,
+//! four compare channels, their flags and interrupt. Capture, PWM outputs and slave modes are not
+//! modelled.
+
+const CEN: u32 = 1;
+const UDIS: u32 = 1 << 1;
+const URS: u32 = 1 << 2;
+const OPM: u32 = 1 << 3;
+const ARPE: u32 = 1 << 7;
+/// UIF, and the flags of compare channels 1 to 4 above it.
+const UIF: u32 = 1;
+
+/// One timer.
+#[derive(Clone, Debug)]
+pub struct Timer {
+    /// 0xFFFF or 0xFFFF_FFFF.
+    max: u32,
+    cycles_per_clock: u64,
+    control: u32,
+    control2: u32,
+    slave: u32,
+    interrupts: u32,
+    flags: u32,
+    modes: [u32; 3],
+    count: u32,
+    /// When `count` was last a whole number of ticks.
+    since: u64,
+    prescaler: u32,
+    next_prescaler: u32,
+    reload: u32,
+    next_reload: u32,
+    compare: [u32; 4],
+}
+
+impl Timer {
+    /// A timer of 16 or 32 bits after reset.
+    pub fn new(bits: u32) -> Self {
+        let max = if bits == 32 { u32::MAX } else { 0xFFFF };
+        Self {
+            max,
+            cycles_per_clock: 1,
+            control: 0,
+            control2: 0,
+            slave: 0,
+            interrupts: 0,
+            flags: 0,
+            modes: [0; 3],
+            count: 0,
+            since: 0,
+            prescaler: 0,
+            next_prescaler: 0,
+            reload: max,
+            next_reload: max,
+            compare: [0; 4],
+        }
+    }
+
+    /// Core cycles of the clock that drives it; the count goes on from where it is.
+    pub fn set_cycles_per_clock(&mut self, cycles: u64, now: u64) {
+        if cycles != self.cycles_per_clock {
+            self.advance(now);
+            self.cycles_per_clock = cycles;
+        }
+    }
+
+    /// A timer of the same width and clock after reset.
+    #[must_use]
+    pub fn after_reset(&self) -> Self {
+        let bits = if self.max == u32::MAX { 32 } else { 16 };
+        Self { cycles_per_clock: self.cycles_per_clock, ..Self::new(bits) }
+    }
+
+    /// Reads a register; `None` where there is none.
+    pub fn read(&mut self, offset: u32, now: u64) -> Option<u32> {
+        self.advance(now);
+        Some(match offset {
+            0x00 => self.control,
+            0x04 => self.control2,
+            0x08 => self.slave,
+            0x0C => self.interrupts,
+            0x10 => self.flags,
+            0x14 => 0,
+            0x18..=0x20 => self.modes[(offset - 0x18) as usize / 4],
+            0x24 => self.count,
+            0x28 => self.next_prescaler,
+            0x2C => self.next_reload,
+            0x34..=0x40 => self.compare[(offset - 0x34) as usize / 4],
+            _ => return None,
+        })
+    }
+
+    /// Writes a register; `None` where there is none.
+    pub fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
+        self.advance(now);
+        match offset {
+            0x00 => {
+                if value & CEN != 0 && self.control & CEN == 0 {
+                    self.since = now;
+                }
+                self.control = value & 0x3FF;
+            }
+            0x04 => self.control2 = value,
+            0x08 => self.slave = value,
+            0x0C => self.interrupts = value,
+            // Flags are cleared by writing 0.
+            0x10 => self.flags &= value,
+            0x14 => {
+                if value & 1 != 0 {
+                    self.count = 0;
+                    self.since = now;
+                    if self.control & UDIS == 0 {
+                        self.take_preloads();
+                        self.flags |= if self.control & URS == 0 { UIF } else { 0 };
+                    }
+                }
+                self.flags |= value & 0x1E;
+            }
+            0x18..=0x20 => self.modes[(offset - 0x18) as usize / 4] = value,
+            0x24 => (self.count, self.since) = (value & self.max, now),
+            0x28 => self.next_prescaler = value & 0xFFFF,
+            0x2C => {
+                self.next_reload = value & self.max;
+                if self.control & ARPE == 0 {
+                    self.reload = self.next_reload;
+                }
+            }
+            0x34..=0x40 => self.compare[(offset - 0x34) as usize / 4] = value & self.max,
+            _ => return None,
+        }
+        Some(())
+    }
+
+    /// Whether an enabled flag stands.
+    pub fn irq(&self) -> bool {
+        self.flags & self.interrupts & 0x1F != 0
+    }
+
+    /// When the next enabled flag comes that does not stand yet.
+    pub fn next_event(&self) -> Option<u64> {
+        let wanted = self.interrupts & !self.flags & 0x1F;
+        if self.control & CEN == 0 || wanted == 0 {
+            return None;
+        }
+        let ticks = (0..5).filter(|flag| wanted >> flag & 1 != 0).filter_map(|flag| match flag {
+            0 => Some(self.ticks_to_update()),
+            channel => self.ticks_to(self.compare[channel - 1]),
+        });
+        Some(self.since + ticks.min()? * self.tick())
+    }
+
+    /// Counts up to `now`.
+    pub fn advance(&mut self, now: u64) {
+        if self.control & CEN == 0 {
+            self.since = now;
+            return;
+        }
+        loop {
+            let ticks = now.saturating_sub(self.since) / self.tick();
+            if ticks == 0 {
+                return;
+            }
+            let to_update = self.ticks_to_update();
+            let step = ticks.min(to_update);
+            for channel in 0..4 {
+                if self.ticks_to(self.compare[channel]).is_some_and(|due| due <= step) {
+                    self.flags |= UIF << (1 + channel);
+                }
+            }
+            self.since += step * self.tick();
+            if step < to_update {
+                self.count += step as u32;
+                return;
+            }
+            self.count = 0;
+            if self.control & UDIS == 0 {
+                self.take_preloads();
+                self.flags |= UIF;
+            }
+            if self.control & OPM != 0 {
+                self.control &= !CEN;
+                return;
+            }
+        }
+    }
+
+    fn take_preloads(&mut self) {
+        self.prescaler = self.next_prescaler;
+        self.reload = self.next_reload;
+    }
+
+    /// Core cycles of a count.
+    fn tick(&self) -> u64 {
+        self.cycles_per_clock * (u64::from(self.prescaler) + 1)
+    }
+
+    fn ticks_to_update(&self) -> u64 {
+        // A count beyond the reload value goes on to the top.
+        let top = if self.count > self.reload { self.max } else { self.reload };
+        u64::from(top - self.count) + 1
+    }
+
+    /// Ticks until the count becomes `value`, within this turn or by the turn's reload.
+    fn ticks_to(&self, value: u32) -> Option<u64> {
+        if value > self.count && (value <= self.reload || self.count > self.reload) {
+            Some(u64::from(value - self.count))
+        } else if value <= self.reload {
+            Some(self.ticks_to_update() + u64::from(value))
+        } else {
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The firmware's stamp timer: 72 MHz / 6.
+    fn stamp_timer() -> Timer {
+        let mut timer = Timer::new(32);
+        timer.set_cycles_per_clock(2, 0);
+        timer.write(0x28, 5, 0).unwrap();
+        timer.write(0x14, 1, 0).unwrap();
+        timer.write(0x10, 0, 0).unwrap();
+        timer.write(0x00, CEN, 0).unwrap();
+        timer
+    }
+
+    #[test]
+    fn it_counts_twelve_million_a_second() {
+        let mut timer = stamp_timer();
+        assert_eq!(timer.read(0x24, 144_000_000).unwrap(), 12_000_000);
+        assert_eq!(timer.read(0x24, 144_000_011).unwrap(), 12_000_000);
+        assert_eq!(timer.read(0x24, 144_000_012).unwrap(), 12_000_001);
+    }
+
+    #[test]
+    fn it_wraps_at_32_bits() {
+        let mut timer = stamp_timer();
+        timer.write(0x24, u32::MAX, 0).unwrap();
+        timer.write(0x0C, UIF, 0).unwrap();
+        assert_eq!(timer.next_event(), Some(12));
+        assert_eq!(timer.read(0x24, 12).unwrap(), 0);
+        assert!(timer.irq());
+        assert_eq!(timer.read(0x10, 12).unwrap() & UIF, UIF);
+    }
+
+    #[test]
+    fn a_compare_interrupt_comes_at_its_tick() {
+        let mut timer = stamp_timer();
+        timer.write(0x34, 100, 0).unwrap();
+        timer.write(0x0C, UIF << 1, 0).unwrap();
+        assert_eq!(timer.next_event(), Some(1200));
+        timer.advance(1199);
+        assert!(!timer.irq());
+        timer.advance(1200);
+        assert!(timer.irq());
+        timer.write(0x10, !(UIF << 1), 1300).unwrap();
+        assert!(!timer.irq());
+        // The same value again a whole turn later.
+        assert_eq!(timer.next_event(), Some((100 + (1 << 32)) * 12));
+    }
+
+    #[test]
+    fn a_periodic_tick_comes_every_period() {
+        let mut timer = Timer::new(16);
+        timer.set_cycles_per_clock(2, 0);
+        timer.write(0x28, 71, 0).unwrap();
+        timer.write(0x2C, 999, 0).unwrap();
+        timer.write(0x14, 1, 0).unwrap();
+        timer.write(0x10, 0, 0).unwrap();
+        timer.write(0x0C, UIF, 0).unwrap();
+        timer.write(0x00, CEN, 0).unwrap();
+        for n in 1..=3 {
+            assert_eq!(timer.next_event(), Some(n * 144_000));
+            timer.advance(n * 144_000);
+            assert!(timer.irq());
+            timer.write(0x10, 0, n * 144_000).unwrap();
+        }
+    }
+}

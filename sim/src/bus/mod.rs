@@ -15,6 +15,7 @@ use std::collections::VecDeque;
 use cantap_wire::Frame;
 use cantap_wire::record::BusErrorKind;
 
+use crate::can::fault::Counters;
 use crate::can::{CanPair, Mode};
 use bits::FrameBits;
 pub use node::{BitTime, Node, Source};
@@ -302,7 +303,7 @@ impl Wire {
         let senders = members.len();
         members.extend(collided.iter().map(|(member, _)| *member));
         let receivers: Vec<Member> =
-            self.members().filter(|member| !members.contains(member) && self.listens(*member, can)).collect();
+            self.members().filter(|member| !members.contains(member) && listens(*member, can)).collect();
         members.extend(&receivers);
         let participants: Vec<Participant> = members
             .iter()
@@ -320,7 +321,7 @@ impl Wire {
             .collect();
         let disturbance = self.take_disturbance();
         let outcome = Outcome::of(&bits, &participants, disturbance);
-        self.count_dominant(&bits, &members, &participants, &outcome, &losers, &collided, can);
+        count_dominant(&bits, &members, &participants, &outcome, &losers, &collided, can);
 
         let at = |bits: usize| start + bit.cycles(bits as u64);
         let mut steps: Vec<(u64, Step)> =
@@ -361,13 +362,6 @@ impl Wire {
             steps: steps.into(),
         });
         self.started += 1;
-    }
-
-    fn listens(&self, member: Member, can: &CanPair) -> bool {
-        match member {
-            Member::Controller(n) => can.controllers[n].listens(),
-            Member::Node(_) => true,
-        }
     }
 
     /// Whether a member acknowledges, and whether it flags errors with dominant bits.
@@ -415,37 +409,6 @@ impl Wire {
             .map(|(_, disturbance)| disturbance)
     }
 
-    /// Adds what each emulated controller puts on the bus in this frame.
-    #[expect(clippy::too_many_arguments, reason = "everything there is to know of one frame")]
-    fn count_dominant(
-        &self,
-        bits: &FrameBits,
-        members: &[Member],
-        participants: &[Participant],
-        outcome: &Outcome,
-        losers: &[(Member, usize)],
-        collided: &[(Member, usize)],
-        can: &mut CanPair,
-    ) {
-        for (who, member) in members.iter().enumerate() {
-            let Member::Controller(n) = *member else { continue };
-            let detection = outcome.of_participant(who);
-            let sends = participants[who].sender || collided.iter().any(|(other, _)| other == member);
-            let mut driven = 0;
-            if sends {
-                driven += bits.dominant_in(detection.map_or(bits.len(), |detection| detection.bit + 1));
-            }
-            driven += u64::from(outcome.acknowledged_by.contains(&who));
-            driven += if detection.is_some() && participants[who].flags { outcome::FLAG as u64 } else { 0 };
-            can.controllers[n].drove(driven);
-        }
-        for (member, lost_at) in losers {
-            if let Member::Controller(n) = *member {
-                can.controllers[n].drove(bits.dominant_in(*lost_at));
-            }
-        }
-    }
-
     /// Sequences of eleven recessive bits since the last frame, for controllers in bus-off.
     fn count_recovery(&self, can: &mut CanPair, start: u64) {
         for n in &self.attached {
@@ -487,7 +450,7 @@ impl Wire {
                     node.counters.receive_error(seen.first);
                 }
                 if node.counters.bus_off() {
-                    node.counters = Default::default();
+                    node.counters = Counters::default();
                     node.not_before = self.now + recovery;
                 }
             }
@@ -572,4 +535,41 @@ fn first_difference(one: &FrameBits, other: &FrameBits) -> Option<usize> {
 /// Whether the first bit in which they differ is dominant in `one`.
 fn beats(one: &FrameBits, other: &FrameBits) -> bool {
     first_difference(one, other).is_some_and(|bit| one.levels().get(bit) == Some(&false))
+}
+
+/// Whether a member takes part in what happens on the bus.
+fn listens(member: Member, can: &CanPair) -> bool {
+    match member {
+        Member::Controller(n) => can.controllers[n].listens(),
+        Member::Node(_) => true,
+    }
+}
+
+/// Adds what each emulated controller puts on the bus in this frame.
+fn count_dominant(
+    bits: &FrameBits,
+    members: &[Member],
+    participants: &[Participant],
+    outcome: &Outcome,
+    losers: &[(Member, usize)],
+    collided: &[(Member, usize)],
+    can: &mut CanPair,
+) {
+    for (who, member) in members.iter().enumerate() {
+        let Member::Controller(n) = *member else { continue };
+        let detection = outcome.of_participant(who);
+        let sends = participants[who].sender || collided.iter().any(|(other, _)| other == member);
+        let mut driven = 0;
+        if sends {
+            driven += bits.dominant_in(detection.map_or(bits.len(), |detection| detection.bit + 1));
+        }
+        driven += u64::from(outcome.acknowledged_by.contains(&who));
+        driven += if detection.is_some() && participants[who].flags { outcome::FLAG as u64 } else { 0 };
+        can.controllers[n].drove(driven);
+    }
+    for (member, lost_at) in losers {
+        if let Member::Controller(n) = *member {
+            can.controllers[n].drove(bits.dominant_in(*lost_at));
+        }
+    }
 }

@@ -35,14 +35,14 @@ impl Fifo {
     pub fn put(&mut self, frame: Frame, filter: u8, locked: bool) -> bool {
         let entry = Entry { frame, filter };
         let lost = self.entries.len() == DEPTH;
-        if !lost {
-            self.entries.push_back(entry);
-        } else {
+        if lost {
             self.overrun = true;
             self.lost += 1;
             if !locked {
                 self.entries[DEPTH - 1] = entry;
             }
+        } else {
+            self.entries.push_back(entry);
         }
         // Set when the third frame is stored, cleared by software only.
         self.full |= self.entries.len() == DEPTH;

@@ -50,7 +50,7 @@ impl Filters {
             0x20C => self.wide,
             0x214 => self.fifo,
             0x21C => self.active,
-            0x240..0x320 => self.banks[((offset - 0x240) / 8) as usize][(offset / 4 & 1) as usize],
+            0x240..0x320 => self.banks[((offset - 0x240) / 8) as usize][half(offset)],
             _ => return None,
         })
     }
@@ -71,7 +71,7 @@ impl Filters {
                 if !init && self.active >> bank & 1 != 0 {
                     return None;
                 }
-                self.banks[bank as usize][(offset / 4 & 1) as usize] = value;
+                self.banks[bank as usize][half(offset)] = value;
             }
             _ => return None,
         }
@@ -127,6 +127,11 @@ impl Filters {
     }
 }
 
+/// Whether an offset names a bank's first or second register.
+fn half(offset: u32) -> usize {
+    (offset / 4 % 2) as usize
+}
+
 /// The 16-bit form of an identifier word: STID, RTR, IDE, EXID[17:15].
 fn short_form(word: u32) -> u16 {
     let (stid, exid_high) = (word >> 21 & 0x7FF, word >> 18 & 7);
@@ -167,15 +172,15 @@ mod tests {
         filters
     }
 
-    fn found(fifo: usize, index: u8) -> Option<Match> {
-        Some(Match { fifo, index })
+    fn to(fifo: usize, index: u8) -> Match {
+        Match { fifo, index }
     }
 
     #[test]
     fn a_32_bit_mask_takes_its_identifiers_and_no_other() {
         let filters = filters(&[(0, true, false, false, [std(0x120), std(0x7F0) | IDE | RTR])]);
-        assert_eq!(filters.accept(0, std(0x120)), found(0, 0));
-        assert_eq!(filters.accept(0, std(0x12F)), found(0, 0));
+        assert_eq!(filters.accept(0, std(0x120)), Some(to(0, 0)));
+        assert_eq!(filters.accept(0, std(0x12F)), Some(to(0, 0)));
         for other in [std(0x130), std(0x120) | RTR, ext(0x120 << 18)] {
             assert_eq!(filters.accept(0, other), None);
         }
@@ -184,8 +189,8 @@ mod tests {
     #[test]
     fn a_32_bit_list_takes_exactly_its_two() {
         let filters = filters(&[(0, true, true, true, [std(0x123), ext(0x1234_5678)])]);
-        assert_eq!(filters.accept(0, std(0x123)), found(1, 0));
-        assert_eq!(filters.accept(0, ext(0x1234_5678)), found(1, 1));
+        assert_eq!(filters.accept(0, std(0x123)), Some(to(1, 0)));
+        assert_eq!(filters.accept(0, ext(0x1234_5678)), Some(to(1, 1)));
         for other in [std(0x122), ext(0x1234_5679), std(0x123) | RTR, ext(0x123)] {
             assert_eq!(filters.accept(0, other), None);
         }
@@ -193,17 +198,17 @@ mod tests {
 
     #[test]
     fn the_16_bit_forms_see_the_upper_three_extended_bits() {
-        let half = |word| u32::from(short_form(word));
+        let short = |word| u32::from(short_form(word));
         let list = filters(&[(
             0,
             false,
             true,
             false,
-            [half(std(1)) | half(std(2)) << 16, half(std(3)) | half(ext(7 << 15)) << 16],
+            [short(std(1)) | short(std(2)) << 16, short(std(3)) | short(ext(7 << 15)) << 16],
         )]);
-        assert_eq!(list.accept(0, std(1)), found(0, 0));
-        assert_eq!(list.accept(0, std(3)), found(0, 2));
-        assert_eq!(list.accept(0, ext(7 << 15 | 0x1234)), found(0, 3));
+        assert_eq!(list.accept(0, std(1)), Some(to(0, 0)));
+        assert_eq!(list.accept(0, std(3)), Some(to(0, 2)));
+        assert_eq!(list.accept(0, ext(7 << 15 | 0x1234)), Some(to(0, 3)));
         assert_eq!(list.accept(0, ext(6 << 15)), None);
         assert_eq!(list.accept(0, std(4)), None);
         let mask = filters(&[(
@@ -211,10 +216,10 @@ mod tests {
             false,
             false,
             false,
-            [half(std(0x100)) | 0xE000 << 16, half(std(0x7FF)) | 0xFFFF << 16],
+            [short(std(0x100)) | 0xE000 << 16, short(std(0x7FF)) | 0xFFFF << 16],
         )]);
-        assert_eq!(mask.accept(0, std(0x1AB)), found(0, 0));
-        assert_eq!(mask.accept(0, std(0x7FF)), found(0, 1));
+        assert_eq!(mask.accept(0, std(0x1AB)), Some(to(0, 0)));
+        assert_eq!(mask.accept(0, std(0x7FF)), Some(to(0, 1)));
         assert_eq!(mask.accept(0, std(0x2AB)), None);
     }
 
@@ -226,8 +231,8 @@ mod tests {
             (1, true, false, true, everything),
             (2, true, true, false, [std(5), std(6)]),
         ]);
-        assert_eq!(filters.accept(0, std(5)), found(0, 2), "the list, numbered after bank 0's two masks");
-        assert_eq!(filters.accept(0, std(9)), found(1, 0), "the 32-bit mask before the 16-bit one");
+        assert_eq!(filters.accept(0, std(5)), Some(to(0, 2)), "the list, numbered after bank 0's two masks");
+        assert_eq!(filters.accept(0, std(9)), Some(to(1, 0)), "the 32-bit mask before the 16-bit one");
     }
 
     #[test]
@@ -235,16 +240,16 @@ mod tests {
         let filters =
             filters(&[(13, true, true, false, [std(1), std(1)]), (14, true, true, false, [std(2), std(2)])]);
         // Bank 13 is CAN1's fourteenth; the inactive ones before it hold two 16-bit masks each.
-        assert_eq!(filters.accept(0, std(1)), found(0, 26));
+        assert_eq!(filters.accept(0, std(1)), Some(to(0, 26)));
         assert_eq!(filters.accept(0, std(2)), None);
-        assert_eq!(filters.accept(1, std(2)), found(0, 0));
+        assert_eq!(filters.accept(1, std(2)), Some(to(0, 0)));
         assert_eq!(filters.accept(1, std(1)), None);
     }
 
     #[test]
     fn nothing_is_received_in_filter_initialisation() {
         let mut filters = filters(&[(0, true, false, false, [0, 0])]);
-        assert_eq!(filters.accept(0, std(1)), found(0, 0));
+        assert_eq!(filters.accept(0, std(1)), Some(to(0, 0)));
         filters.write(0x200, 14 << 8 | FINIT).unwrap();
         assert_eq!(filters.accept(0, std(1)), None);
     }

@@ -59,13 +59,13 @@ pub struct OddAccess {
 struct Device {
     range: Range<u32>,
     irq: u16,
-    device: Arc<Mutex<dyn Peripheral + Send>>,
+    model: Arc<Mutex<dyn Peripheral + Send>>,
 }
 
 impl Device {
     /// A peer that panicked while it held the lock leaves a state that is as good as any other.
     fn lock(&self) -> MutexGuard<'_, dyn Peripheral + Send + 'static> {
-        self.device.lock().unwrap_or_else(PoisonError::into_inner)
+        self.model.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -114,8 +114,8 @@ impl Board {
     }
 
     /// Puts a device at a range of addresses, with an interrupt line.
-    pub fn attach(&mut self, range: Range<u32>, irq: u16, device: Arc<Mutex<dyn Peripheral + Send>>) {
-        self.devices.push(Device { range, irq, device });
+    pub fn attach(&mut self, range: Range<u32>, irq: u16, model: Arc<Mutex<dyn Peripheral + Send>>) {
+        self.devices.push(Device { range, irq, model });
     }
 
     /// A system reset: everything but memories and the buses, whose nodes go on.

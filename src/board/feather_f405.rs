@@ -5,8 +5,9 @@
 //!   D9/D10 (PB8/PB9), LED on PC1 lit by high, USB on PA11/PA12, SD_DETECT on PB12, SCK on PB13, the flash chip's
 //!   MOSI on PB5.
 //! - Zephyr 4.3 `boards/adafruit/feather_stm32f405`: the same crystal, LED and USB pins.
-//! - DS8626 Rev 9, table 9: CAN2 has PB5 or PB12 for RX, PB6 or PB13 for TX, all as AF9. Neither RX pin is on the
-//!   headers; PB12 goes to the card socket's detect switch, which is open without a card.
+//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: CAN2 has PB5 or PB12 for RX, PB6 or PB13 for TX, all as AF9. Neither RX
+//!   pin is on the headers; PB12 goes to the card socket's detect switch, which is open without a card (MicroPython
+//!   reads it with a pull-up, low for a card).
 
 use stm32f4xx_hal::gpio::{GpioExt, PinState};
 use stm32f4xx_hal::otg_fs::USB;

@@ -8,7 +8,8 @@
 //!   pull-up to the USB line, PB12 to PB15 go to the card socket.
 //! - Feaser LibMicroBLT `demos/ARMCM4_STM32F4_Olimex_STM32P405_CubeIDE/App/led.c`: PC12 low lights the LED. (Zephyr
 //!   and RIOT say high; this demonstration was made for the board and the P103's LED is lit by low, too.)
-//! - DS8626 Rev 9, table 9: AF9 is CAN1 on PB8/PB9 and CAN2 on PB5/PB6, AF10 is OTG_FS on PA11/PA12.
+//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PB8/PB9 and CAN2 on PB5/PB6, AF10 is OTG_FS on PA11/PA12.
+//! - SN65HVD230 data sheet (SLOS346), "RS": low selects the high-speed mode.
 
 use stm32f4xx_hal::gpio::{GpioExt, PinState};
 use stm32f4xx_hal::otg_fs::USB;
@@ -32,7 +33,7 @@ pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
     b.pb9.into_alternate::<9>();
     b.pb5.into_alternate::<9>().internal_pull_up(true);
     b.pb6.into_alternate::<9>();
-    // High-speed mode: full slew rate, and the receiver hears even in listen-only (SN65HVD230, Rs low).
+    // The transceiver's high-speed mode; high would be standby.
     c.pc10.into_push_pull_output_in_state(PinState::Low);
     // The chip pulls the USB line up by itself.
     c.pc11.into_push_pull_output_in_state(PinState::High);

@@ -297,7 +297,8 @@ impl Control for CanControl {
             w.silm().bit(silent).lbkm().bit(loopback)
         });
         self.can.mcr().modify(|_, w| {
-            // The stamps of time-triggered mode are not to be used (ES0182, "bxCAN").
+            // The stamps of time-triggered mode are not to be used (ES0206 2.13.1, for the F42x; the F405 is taken for
+            // alike).
             w.ttcm().clear_bit();
             w.abom().bit(!config.manual_recovery);
             w.awum().clear_bit();

@@ -2,7 +2,7 @@
 //! interface").
 //!
 //! Erasing and programming stop every instruction fetch from flash: 16 µs for a word, which the receive FIFOs
-//! bear, up to 2 s for the sector, which they do not (DS8626 Rev 9, table 40).
+//! bear, up to 2 s for the sector, which they do not (STM32F405 data sheet, "Flash memory programming").
 
 use cantap_firmware::saved::Sector;
 use stm32f4xx_hal::pac::FLASH;

@@ -11,7 +11,8 @@ const REFERENCE: u8 = 17;
 /// A conversion takes 480 + 12 clocks at 18 MHz, 27 µs; so many reads of a register take longer. The bound keeps
 /// a chip without an ADC from hanging.
 const MOST_READS: u32 = 10_000;
-/// Longest sampling time, 480 clocks at 18 MHz = 27 µs; the sensors ask for 10 µs (DS8626 Rev 9, tables 70 and 73).
+/// Longest sampling time, 480 clocks at 18 MHz = 27 µs; the sensors ask for 10 µs (STM32F405 data sheet,
+/// "Temperature sensor characteristics" and "Embedded reference voltage").
 const SAMPLE_480: u8 = 0b111;
 
 /// ADC1, switched on.
@@ -21,7 +22,7 @@ impl Sensors {
     /// Switches the ADC and the sensors on.
     pub fn start(adc: ADC1, common: &ADC_COMMON, rcc: &mut Rcc) -> Self {
         ADC1::enable(rcc);
-        // 72 MHz / 4 = 18 MHz; at most 36 (DS8626 Rev 9, table 67).
+        // 72 MHz / 4 = 18 MHz; at most 36 (data sheet, "ADC characteristics").
         common.ccr().modify(|_, w| w.adcpre().div4().tsvrefe().enabled());
         adc.cr2().modify(|_, w| w.adon().enabled());
         adc.smpr1().modify(|_, w| {

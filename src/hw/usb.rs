@@ -11,8 +11,8 @@ use usbd_serial::{CdcAcmClass, USB_CLASS_CDC};
 
 /// Words for received packets: 64 bytes each for endpoint 0 and the data endpoint.
 const RECEIVE_WORDS: usize = 2 * PACKET / 4;
-/// Current that the boards draw from the bus at most, in mA: 93 mA for the chip at 168 MHz with all peripherals (DS8626
-/// Rev 9, table 20), and the LEDs and transceivers.
+/// Current that is asked of the bus, in mA: chip, LEDs and two transceivers with room to spare, and half of what a
+/// port gives.
 const MAX_POWER_MA: usize = 250;
 /// IN endpoints beside endpoint 0.
 const IN_ENDPOINTS: core::ops::RangeInclusive<usize> = 1..=3;

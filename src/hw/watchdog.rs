@@ -4,8 +4,8 @@ use stm32f4xx_hal::pac::{DBGMCU, IWDG};
 use stm32f4xx_hal::prelude::*;
 use stm32f4xx_hal::watchdog::IndependentWatchdog;
 
-/// Period in ms. Longer than the 2 s that erasing the sector of saved settings may take (DS8626 Rev 9, table 40,
-/// 32 bits at a time), during which nothing runs, and that with the watchdog's oscillator at its fastest, 47 kHz
+/// Period in ms. Longer than the 2 s that erasing the sector of saved settings may take (STM32F405 data
+/// sheet, "Flash memory programming", 32 bits at a time), during which nothing runs, and that with the watchdog's oscillator at its fastest, 47 kHz
 /// rather than 32 kHz: 4000 ms × 32 / 47 = 2.7 s.
 const PERIOD_MS: u32 = 4_000;
 

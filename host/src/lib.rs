@@ -6,6 +6,7 @@ pub mod device;
 pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
+pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;
 #[cfg(feature = "signals")]

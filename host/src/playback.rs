@@ -1,0 +1,379 @@
+//! A trace played back: its records handed out when they are due, at any speed.
+//!
+//! It knows no clock and never waits: the caller says what time it is, and gets the records that are due by
+//! then, or how long to sleep. So the same engine drives the live view and a test.
+
+use std::time::Duration;
+
+use crate::TraceRecord;
+
+/// The delay factors that [`Playback::faster`] and [`Playback::slower`] step through: real time is 1, more
+/// is slow motion.
+const FACTORS: [f64; 16] =
+    [0.0, 0.001, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 1000.0];
+
+/// The slowest that can be asked for.
+const MOST_FACTOR: f64 = 1e6;
+
+/// A pause in the trace longer than this is played as one of this length, if gaps are to be skipped.
+const SKIPPED_TO: Duration = Duration::from_secs(1);
+
+/// What there is to do now.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Due {
+    /// This record is due.
+    Record(TraceRecord),
+    /// Nothing is due for so long.
+    Wait(Duration),
+    /// Paused: nothing is due before [`Playback::resume`], [`Playback::step`] or the like.
+    Paused,
+    /// The trace is over, and it is not played in a loop.
+    Ended,
+}
+
+/// Plays a trace that `open` begins anew whenever it is asked to, for the loop.
+pub struct Playback<O, I> {
+    open: O,
+    records: I,
+    next: Option<TraceRecord>,
+    /// The trace's time that [`Self::anchor_at`] stands for.
+    anchor_trace_ns: i64,
+    /// The caller's time at which the trace stood at [`Self::anchor_trace_ns`].
+    anchor_at: Duration,
+    factor: f64,
+    paused: bool,
+    /// Records to hand out although paused.
+    steps: u64,
+    looped: bool,
+    skips_gaps: bool,
+    /// Rounds that were played to the end.
+    rounds: u64,
+    last_ns: Option<i64>,
+}
+
+impl<O, I, E> Playback<O, I>
+where
+    O: FnMut() -> Result<I, E>,
+    I: Iterator<Item = TraceRecord>,
+{
+    /// Opens the trace and plays it in real time from `now` on. Times are the caller's: any clock that goes
+    /// forward.
+    pub fn new(mut open: O, now: Duration) -> Result<Self, E> {
+        let mut records = open()?;
+        let next = records.next();
+        Ok(Self {
+            open,
+            records,
+            anchor_trace_ns: next.map_or(0, |record| record.time_ns),
+            next,
+            anchor_at: now,
+            factor: 1.0,
+            paused: false,
+            steps: 0,
+            looped: false,
+            skips_gaps: false,
+            rounds: 0,
+            last_ns: None,
+        })
+    }
+
+    /// What is due at `now`. Asked again and again, it hands out every record once and in order.
+    pub fn poll(&mut self, now: Duration) -> Result<Due, E> {
+        let Some(record) = self.next else {
+            if !self.looped || self.last_ns.is_none() {
+                return Ok(Due::Ended);
+            }
+            self.start_over(now)?;
+            return self.poll_next(now);
+        };
+        if self.steps > 0 {
+            self.steps -= 1;
+            self.take(record);
+            // What comes then is due as if this one had been in time.
+            self.anchor(record.time_ns, now);
+            return Ok(Due::Record(record));
+        }
+        self.poll_next(now)
+    }
+
+    fn poll_next(&mut self, now: Duration) -> Result<Due, E> {
+        let Some(record) = self.next else {
+            return Ok(Due::Ended);
+        };
+        if self.paused {
+            return Ok(Due::Paused);
+        }
+        // A clock that was set back in the trace must not stop it, nor one that was set ahead.
+        let ahead = record.time_ns.saturating_sub(self.last_ns.unwrap_or(self.anchor_trace_ns));
+        if ahead < 0 || (self.skips_gaps && ahead > SKIPPED_TO.as_nanos() as i64) {
+            let wait = if ahead < 0 { 0 } else { SKIPPED_TO.as_nanos() as i64 };
+            let position = self.position_ns(now).max(self.last_ns.unwrap_or(i64::MIN));
+            let played_since = position.saturating_sub(self.last_ns.unwrap_or(position)).clamp(0, wait);
+            self.anchor(record.time_ns.saturating_sub(wait - played_since), now);
+            self.last_ns = Some(self.anchor_trace_ns);
+        }
+        let due = self.due_at(record.time_ns);
+        if due <= now {
+            self.take(record);
+            return Ok(Due::Record(record));
+        }
+        Ok(Due::Wait(due.saturating_sub(now)))
+    }
+
+    fn take(&mut self, record: TraceRecord) {
+        self.last_ns = Some(record.time_ns);
+        self.next = self.records.next();
+        if self.next.is_none() {
+            self.rounds += 1;
+        }
+    }
+
+    /// When a record with this trace time is due.
+    fn due_at(&self, trace_ns: i64) -> Duration {
+        let ahead = trace_ns.saturating_sub(self.anchor_trace_ns).max(0) as f64;
+        // A trace of centuries in slow motion is longer than a Duration holds.
+        let ahead = Duration::try_from_secs_f64(ahead * self.factor / 1e9).unwrap_or(Duration::MAX);
+        self.anchor_at.saturating_add(ahead)
+    }
+
+    fn anchor(&mut self, trace_ns: i64, now: Duration) {
+        self.anchor_trace_ns = trace_ns;
+        self.anchor_at = now;
+    }
+
+    /// The trace's time at `now`, in nanoseconds as in [`TraceRecord::time_ns`]; never past the next record
+    /// that was not handed out.
+    pub fn position_ns(&self, now: Duration) -> i64 {
+        let limit =
+            self.next.map_or(self.last_ns, |record| Some(record.time_ns)).unwrap_or(self.anchor_trace_ns);
+        if self.paused {
+            return self.anchor_trace_ns.min(limit);
+        }
+        if self.factor == 0.0 {
+            return self.last_ns.unwrap_or(self.anchor_trace_ns);
+        }
+        let played = now.saturating_sub(self.anchor_at).as_nanos() as f64 / self.factor;
+        self.anchor_trace_ns.saturating_add(played as i64).min(limit)
+    }
+
+    /// Begins the trace anew, as at the end in a loop.
+    pub fn start_over(&mut self, now: Duration) -> Result<(), E> {
+        self.records = (self.open)()?;
+        self.next = self.records.next();
+        self.last_ns = None;
+        self.anchor(self.next.map_or(0, |record| record.time_ns), now);
+        Ok(())
+    }
+
+    /// The delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as can be.
+    pub fn factor(&self) -> f64 {
+        self.factor
+    }
+
+    /// Sets the delay factor from `now` on; it is kept between 0 and a million. What is not a number
+    /// changes nothing.
+    pub fn set_factor(&mut self, factor: f64, now: Duration) {
+        if !factor.is_nan() {
+            let position = self.position_ns(now);
+            self.factor = factor.clamp(0.0, MOST_FACTOR);
+            self.anchor(position, now);
+        }
+    }
+
+    /// One step faster.
+    pub fn faster(&mut self, now: Duration) {
+        let factor = FACTORS.into_iter().rev().find(|factor| *factor < self.factor).unwrap_or(0.0);
+        self.set_factor(factor, now);
+    }
+
+    /// One step slower.
+    pub fn slower(&mut self, now: Duration) {
+        let factor = FACTORS.into_iter().find(|factor| *factor > self.factor).unwrap_or(self.factor);
+        self.set_factor(factor, now);
+    }
+
+    /// Whether it is paused.
+    pub fn is_paused(&self) -> bool {
+        self.paused
+    }
+
+    /// Stops the trace's time.
+    pub fn pause(&mut self, now: Duration) {
+        if !self.paused {
+            let position = self.position_ns(now);
+            self.anchor(position, now);
+            self.paused = true;
+        }
+    }
+
+    /// Lets the trace's time go on where it was stopped.
+    pub fn resume(&mut self, now: Duration) {
+        if self.paused {
+            self.anchor(self.anchor_trace_ns, now);
+            self.paused = false;
+            self.steps = 0;
+        }
+    }
+
+    /// Pauses and hands out the next record at once.
+    pub fn step(&mut self, now: Duration) {
+        self.pause(now);
+        self.steps += 1;
+    }
+
+    /// Whether the trace begins anew after its end.
+    pub fn is_looped(&self) -> bool {
+        self.looped
+    }
+
+    /// Lets the trace begin anew after its end, or not.
+    pub fn set_looped(&mut self, looped: bool) {
+        self.looped = looped;
+    }
+
+    /// Plays pauses of more than a second as a second, or not.
+    pub fn set_skips_gaps(&mut self, skips: bool) {
+        self.skips_gaps = skips;
+    }
+
+    /// Rounds that were played to the end.
+    pub fn rounds(&self) -> u64 {
+        self.rounds
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::TraceEvent;
+    use std::convert::Infallible;
+
+    const MS: i64 = 1_000_000;
+
+    fn at(ms: i64) -> TraceRecord {
+        TraceRecord {
+            time_ns: 1_000_000_000_000 + ms * MS,
+            channel: 1,
+            event: TraceEvent::ErrorsSuppressed { count: 1 },
+        }
+    }
+
+    fn ms(ms: u64) -> Duration {
+        Duration::from_millis(ms)
+    }
+
+    fn playing(
+        times_ms: &[i64],
+    ) -> Playback<
+        impl FnMut() -> Result<std::vec::IntoIter<TraceRecord>, Infallible> + use<>,
+        std::vec::IntoIter<TraceRecord>,
+    > {
+        let records: Vec<_> = times_ms.iter().copied().map(at).collect();
+        Playback::new(move || Ok(records.clone().into_iter()), ms(500)).unwrap()
+    }
+
+    /// The times, in milliseconds of the trace, of what is due; then what there is to do.
+    fn due<O, I>(playback: &mut Playback<O, I>, now: u64) -> (Vec<i64>, Due)
+    where
+        O: FnMut() -> Result<I, Infallible>,
+        I: Iterator<Item = TraceRecord>,
+    {
+        let mut times = Vec::new();
+        loop {
+            match playback.poll(ms(now)).unwrap() {
+                Due::Record(record) => times.push((record.time_ns - at(0).time_ns) / MS),
+                other => return (times, other),
+            }
+            assert!(times.len() < 1000, "it never waits");
+        }
+    }
+
+    #[test]
+    fn records_come_at_their_own_distances() {
+        let mut playback = playing(&[0, 10, 30]);
+        assert_eq!(due(&mut playback, 500), (vec![0], Due::Wait(ms(10))));
+        assert_eq!(due(&mut playback, 509), (vec![], Due::Wait(ms(1))));
+        assert_eq!(due(&mut playback, 530), (vec![10, 30], Due::Ended));
+    }
+
+    #[test]
+    fn a_factor_above_one_is_slow_motion_and_zero_does_not_wait() {
+        let mut playback = playing(&[0, 10, 30, 1000]);
+        playback.set_factor(2.0, ms(500));
+        assert_eq!(due(&mut playback, 519), (vec![0], Due::Wait(ms(1))));
+        assert_eq!(due(&mut playback, 520), (vec![10], Due::Wait(ms(40))));
+        playback.set_factor(0.0, ms(521));
+        assert_eq!(due(&mut playback, 521), (vec![30, 1000], Due::Ended));
+    }
+
+    #[test]
+    fn a_change_of_speed_keeps_the_place() {
+        let mut playback = playing(&[0, 100]);
+        assert_eq!(due(&mut playback, 550), (vec![0], Due::Wait(ms(50))));
+        playback.slower(ms(550));
+        assert!((playback.factor() - 2.0).abs() < 1e-12);
+        assert_eq!(due(&mut playback, 550).1, Due::Wait(ms(100)));
+        playback.faster(ms(600));
+        playback.faster(ms(600));
+        assert!((playback.factor() - 0.5).abs() < 1e-12);
+        assert_eq!(due(&mut playback, 600).1, Due::Wait(Duration::from_micros(12_500)));
+    }
+
+    #[test]
+    fn a_pause_stops_time_and_resuming_goes_on_there() {
+        let mut playback = playing(&[0, 10, 30]);
+        assert_eq!(due(&mut playback, 504).0, [0]);
+        playback.pause(ms(504));
+        assert_eq!(due(&mut playback, 9000), (vec![], Due::Paused));
+        playback.resume(ms(9000));
+        assert_eq!(due(&mut playback, 9000), (vec![], Due::Wait(ms(6))));
+        assert_eq!(due(&mut playback, 9006), (vec![10], Due::Wait(ms(20))));
+    }
+
+    #[test]
+    fn a_step_hands_out_one_record_and_stays_paused() {
+        let mut playback = playing(&[0, 10, 30]);
+        playback.step(ms(500));
+        assert_eq!(due(&mut playback, 500), (vec![0], Due::Paused));
+        playback.step(ms(600));
+        assert_eq!(due(&mut playback, 600), (vec![10], Due::Paused));
+        playback.resume(ms(700));
+        assert_eq!(due(&mut playback, 700), (vec![], Due::Wait(ms(20))));
+    }
+
+    #[test]
+    fn a_loop_begins_anew_and_an_empty_trace_ends() {
+        let mut playback = playing(&[0, 10]);
+        playback.set_looped(true);
+        assert_eq!(due(&mut playback, 509).0, [0]);
+        assert_eq!(due(&mut playback, 510), (vec![10, 0], Due::Wait(ms(10))));
+        assert_eq!((due(&mut playback, 520).0, playback.rounds()), (vec![10, 0], 2));
+        let mut empty = playing(&[]);
+        empty.set_looped(true);
+        assert_eq!(due(&mut empty, 500), (vec![], Due::Ended));
+    }
+
+    #[test]
+    fn a_clock_that_was_set_back_does_not_stop_it() {
+        let mut playback = playing(&[5000, 5010, 0, 10]);
+        assert_eq!(due(&mut playback, 510), (vec![5000, 5010, 0], Due::Wait(ms(10))));
+        assert_eq!(due(&mut playback, 520), (vec![10], Due::Ended));
+    }
+
+    #[test]
+    fn long_gaps_are_cut_to_a_second_if_asked_for() {
+        let mut playback = playing(&[0, 3_600_000]);
+        playback.set_skips_gaps(true);
+        assert_eq!(due(&mut playback, 500), (vec![0], Due::Wait(ms(1000))));
+        assert_eq!(due(&mut playback, 1499), (vec![], Due::Wait(ms(1))));
+        assert_eq!(due(&mut playback, 1500), (vec![3_600_000], Due::Ended));
+    }
+
+    #[test]
+    fn the_position_is_between_the_last_record_and_the_next() {
+        let mut playback = playing(&[0, 10]);
+        assert_eq!(due(&mut playback, 504).0, [0]);
+        assert_eq!(playback.position_ns(ms(504)), at(4).time_ns);
+        assert_eq!(playback.position_ns(ms(5000)), at(10).time_ns);
+    }
+}

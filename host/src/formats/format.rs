@@ -4,16 +4,26 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
+use super::blf;
+
 /// A trace file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub enum Format {
     /// can-utils' log, as `candump -l` writes it.
     Candump,
+    /// Vector's text format.
+    Asc,
+    /// Vector's binary format.
+    Blf,
 }
 
 /// Names, suffixes and a description of each format. The first name is the one shown; the first
 /// format with a suffix is the one that the suffix picks.
-const FORMATS: &[(Format, &[&str], &[&str])] = &[(Format::Candump, &["candump", "log"], &["log", "txt"])];
+const FORMATS: &[(Format, &[&str], &[&str])] = &[
+    (Format::Candump, &["candump", "log"], &["log", "txt"]),
+    (Format::Asc, &["asc"], &["asc"]),
+    (Format::Blf, &["blf"], &["blf"]),
+];
 
 /// No such format.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -52,7 +62,16 @@ impl Format {
 
     /// By a file's first bytes.
     pub fn of_content(head: &[u8]) -> Option<Self> {
-        head.trim_ascii_start().starts_with(b"(").then_some(Self::Candump)
+        let text = head.trim_ascii_start();
+        if head.starts_with(blf::FILE_MAGIC) {
+            Some(Self::Blf)
+        } else if text.starts_with(b"(") {
+            Some(Self::Candump)
+        } else if text.starts_with(b"date ") {
+            Some(Self::Asc)
+        } else {
+            None
+        }
     }
 }
 

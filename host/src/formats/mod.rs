@@ -6,7 +6,11 @@
 //! or output. Each format is a file here, split into a decoder that takes bytes from an
 //! `Input` and an encoder that appends to a buffer; neither knows files, compression or rotation.
 
+mod asc;
+mod blf;
+mod calendar;
 mod candump;
+mod event_text;
 mod format;
 #[allow(dead_code, reason = "the formats that follow use the rest")]
 mod input;
@@ -15,6 +19,7 @@ mod issue;
 mod output;
 mod reader;
 mod rotate;
+mod sja1000;
 #[cfg(test)]
 mod tests;
 #[allow(dead_code, reason = "the formats that follow use the rest")]

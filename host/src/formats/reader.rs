@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
-use super::{Format, UnknownFormat, candump};
+use super::{Format, UnknownFormat, asc, blf, candump};
 use crate::TraceRecord;
 
 /// How to read.
@@ -87,6 +87,8 @@ impl TraceReader {
     fn new(name: Arc<str>, format: Format, input: Input, strict: bool) -> Self {
         let decoder: Box<dyn Decode> = match format {
             Format::Candump => Box::new(candump::Decoder::default()),
+            Format::Asc => Box::new(asc::Decoder::default()),
+            Format::Blf => Box::new(blf::Decoder::default()),
         };
         Self { name, format, input, decoder, strict, issues: 0, ended: false }
     }

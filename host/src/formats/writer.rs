@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::output::{Output, Patch};
 use super::rotate::{Rotating, Rotation};
-use super::{Format, candump};
+use super::{Format, asc, blf, candump};
 use crate::TraceRecord;
 
 /// Bytes collected before they go to the system.
@@ -136,6 +136,8 @@ impl FileWriter {
     pub(crate) fn new(output: Output, format: Format, _options: &WriteOptions) -> Self {
         let encoder: Box<dyn Encode> = match format {
             Format::Candump => Box::new(candump::Encoder),
+            Format::Asc => Box::new(asc::Encoder::default()),
+            Format::Blf => Box::new(blf::Encoder::default()),
         };
         let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
         Self {

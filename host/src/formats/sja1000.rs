@@ -1,0 +1,40 @@
+//! The error code capture register of NXP's SJA1000 controller (data sheet, section 6.4.9): the form in which
+//! Vector's and PEAK's files say what kind of bus error it was.
+
+use cantap_wire::record::BusErrorKind;
+
+/// The two upper bits: kind. Bit 5 is set while receiving. The lower five: the segment of the frame.
+const KIND_SHIFT: u32 = 6;
+const BIT: u8 = 0;
+const FORM: u8 = 1;
+const STUFF: u8 = 2;
+const OTHER: u8 = 3;
+const RECEIVING: u8 = 1 << 5;
+const SEGMENT: u8 = 0x1F;
+const CRC_SEQUENCE: u8 = 0x08;
+const CRC_DELIMITER: u8 = 0x18;
+const ACKNOWLEDGE_SLOT: u8 = 0x19;
+const DATA_FIELD: u8 = 0x0A;
+
+/// The register for a kind of error. It cannot tell the two bit errors apart.
+pub(crate) fn code(kind: BusErrorKind) -> u8 {
+    let (kind, direction, segment) = match kind {
+        BusErrorKind::Stuff => (STUFF, RECEIVING, DATA_FIELD),
+        BusErrorKind::Form => (FORM, RECEIVING, CRC_DELIMITER),
+        BusErrorKind::Acknowledgment => (OTHER, 0, ACKNOWLEDGE_SLOT),
+        BusErrorKind::BitRecessive | BusErrorKind::BitDominant => (BIT, 0, DATA_FIELD),
+        BusErrorKind::Crc => (OTHER, RECEIVING, CRC_SEQUENCE),
+    };
+    kind << KIND_SHIFT | direction | segment
+}
+
+/// The kind of error that the register names, as far as it can.
+pub(crate) fn kind(code: u8) -> Option<BusErrorKind> {
+    match (code >> KIND_SHIFT, code & SEGMENT) {
+        (STUFF, _) => Some(BusErrorKind::Stuff),
+        (FORM, _) => Some(BusErrorKind::Form),
+        (OTHER, ACKNOWLEDGE_SLOT) => Some(BusErrorKind::Acknowledgment),
+        (OTHER, CRC_SEQUENCE | CRC_DELIMITER) => Some(BusErrorKind::Crc),
+        _ => None,
+    }
+}

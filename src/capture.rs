@@ -2,7 +2,8 @@
 //!
 //! The receive interrupt stamps before anything else. A single frame in the FIFO is the one that raised the
 //! interrupt, so its stamp is its end plus the interrupt's latency. Frames found queued behind one
-//! another ended at unknown times before now: their stamp says so, and the host tightens it.
+//! another, or while the FIFO is being drained, ended at unknown times before now: their stamp says so, and
+//! the host tightens it.
 
 use cantap_wire::message::{ChannelConfig, ChannelStatus, Registers};
 use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
@@ -59,7 +60,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// The receive interrupt. `entered` is the clock, read before anything else.
+    /// Drains the FIFO. `entered` is the clock, read by the receive interrupt before anything else.
     #[inline]
     pub fn on_receive(
         &mut self,
@@ -74,6 +75,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             None => (false, false),
         };
         let mut stamp = entered;
+        let mut first = true;
         let mut reply = false;
         loop {
             let pending = traffic.pending();
@@ -82,11 +84,12 @@ impl<'q, const N: usize> Capture<'q, N> {
                 break;
             }
             let mut quality = Stamp::Exact;
-            if pending > 1 {
+            if pending > 1 || !first {
                 // The last of them may have ended after the interrupt was entered.
                 stamp = clock.now();
                 quality = Stamp::UpperBound;
             }
+            first = false;
             let at = self.recorder.time(stamp);
             for _ in 0..pending {
                 let Some(frame) = traffic.receive() else { break };
@@ -106,7 +109,6 @@ impl<'q, const N: usize> Capture<'q, N> {
                 let lost = Event::Lost { channel, stage: LossStage::Controller, count: 1, at_least: true };
                 self.recorder.event(&lost, at);
             }
-            stamp = clock.now();
         }
         if reply {
             let now = self.recorder.time(clock.now());

@@ -2,14 +2,14 @@
 //!
 //! | priority | tasks | why |
 //! |---|---|---|
-//! | 4 | both channels' receive, transmit and error interrupts, the transmission alarm | a FIFO of three frames waits for nobody |
+//! | 5 | both channels' receive interrupts: the stamp, and nothing else | a late stamp is a wrong one |
+//! | 4 | draining both FIFOs, transmit and error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
 //! | 2 | USB, the millisecond tick | a host can be told to wait |
 //! | – | idle | sleeps |
 //!
 //! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock.
-//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI: each lock delays a stamp by its
-//! length. The USB driver masks all interrupts inside its `poll` and packet writes; `docs/benchmarks.md` tells for
-//! how long.
+//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI and so never holds up a stamp. The
+//! USB driver masks all interrupts inside its `poll` and packet writes; `docs/benchmarks.md` tells for how long.
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 #[cfg(target_os = "none")]
@@ -25,6 +25,8 @@ fn main() {
 #[cfg(target_os = "none")]
 #[rtic::app(device = stm32f4xx_hal::pac, peripherals = true)]
 mod app {
+    use core::sync::atomic::{AtomicU32, Ordering};
+
     use cantap_firmware::capture::Capture;
     use cantap_firmware::filters::Layout;
     use cantap_firmware::lights::Activity;
@@ -33,7 +35,10 @@ mod app {
     use cantap_firmware::session::Session;
     use cantap_wire::Channel;
 
+    use stm32f4xx_hal::pac::Interrupt;
+
     use crate::hw::access::{Access, Controls, Tap};
+    use crate::hw::can::Doorbell;
     use crate::hw::stamp::StampTimer;
     use crate::hw::tick::Tick;
     use crate::hw::usb::{Memory, UsbPort};
@@ -44,6 +49,10 @@ mod app {
     struct Shared {
         /// Ceiling 4: what the capture interrupts own.
         tap: Tap,
+        /// When the interrupt stamped CAN1's last frame.
+        can1_entered: AtomicU32,
+        /// When the interrupt stamped CAN2's last frame.
+        can2_entered: AtomicU32,
         /// Only at priority 2.
         #[lock_free]
         session: Session<'static>,
@@ -61,6 +70,10 @@ mod app {
         watchdog: Watchdog,
         can1_clock: StampTimer,
         can2_clock: StampTimer,
+        can1_doorbell: Doorbell,
+        can2_doorbell: Doorbell,
+        can1_reopener: Doorbell,
+        can2_reopener: Doorbell,
         can1_tx_clock: StampTimer,
         can2_tx_clock: StampTimer,
         can1_error_clock: StampTimer,
@@ -74,12 +87,16 @@ mod app {
         let Hardware { can, stamp, tick, usb, mut chip, watchdog, identity, restarted_after_failure } =
             hardware;
         chip.tick(Activity { error: restarted_after_failure, ..Activity::default() });
+        let [can1_doorbell, can2_doorbell] = can.doorbells;
+        let [can1_reopener, can2_reopener] = can.reopeners;
         let mut filters = can.filters;
         filters.write(&Layout::open());
         let (producer, consumer) = cx.local.records.split();
         (
             Shared {
                 tap: Tap { capture: Capture::new(producer), traffic: can.traffic, stamp },
+                can1_entered: AtomicU32::new(0),
+                can2_entered: AtomicU32::new(0),
                 session: Session::new(consumer, identity),
                 usb,
                 controls: Controls { can: can.control, filters, chip, stamp },
@@ -89,6 +106,10 @@ mod app {
                 watchdog,
                 can1_clock: stamp,
                 can2_clock: stamp,
+                can1_doorbell,
+                can2_doorbell,
+                can1_reopener,
+                can2_reopener,
                 can1_tx_clock: stamp,
                 can2_tx_clock: stamp,
                 can1_error_clock: stamp,
@@ -98,26 +119,46 @@ mod app {
         )
     }
 
-    /// Moves frames from CAN1's FIFO 0 to the record queue.
+    /// Stamps the end of a frame on CAN1, and leaves the frame to [`can1_drain`].
     ///
-    /// Priority 4, the highest: FIFO 0 holds three frames (RM0090 Rev 21 §32.7.3) and no frame is shorter than
-    /// 47 µs at 1 Mbit/s, so starting later than 141 µs after the first loses the fourth. Each microsecond of delay is one
-    /// in the stamp. `otg_fs` (2) may wait: USB can NAK.
-    #[task(binds = CAN1_RX0, priority = 4, local = [can1_clock], shared = [tap])]
-    fn can1_rx0(mut cx: can1_rx0::Context) {
-        let entered = cx.local.can1_clock.now();
+    /// Priority 5, the highest, and a dozen instructions: each microsecond of delay is one in the stamp. What can delay it is
+    /// [`can2_rx0`], and the USB driver, which masks all interrupts for a packet's length.
+    #[task(binds = CAN1_RX0, priority = 5, local = [can1_clock, can1_doorbell], shared = [&can1_entered])]
+    fn can1_rx0(cx: can1_rx0::Context) {
+        cx.shared.can1_entered.store(cx.local.can1_clock.now(), Ordering::Relaxed);
+        cx.local.can1_doorbell.silence();
+        rtic::pend(Interrupt::CAN1_RX1);
+    }
+
+    /// As [`can1_rx0`], for CAN2.
+    #[task(binds = CAN2_RX0, priority = 5, local = [can2_clock, can2_doorbell], shared = [&can2_entered])]
+    fn can2_rx0(cx: can2_rx0::Context) {
+        cx.shared.can2_entered.store(cx.local.can2_clock.now(), Ordering::Relaxed);
+        cx.local.can2_doorbell.silence();
+        rtic::pend(Interrupt::CAN2_RX1);
+    }
+
+    /// Moves frames from CAN1's FIFO 0 to the record queue. FIFO 1 is not used, and its interrupt raises this task.
+    ///
+    /// Priority 4: FIFO 0 holds three frames (RM0090 Rev 21 §32.7.3) and no frame is shorter than 47 µs at 1 Mbit/s,
+    /// so starting later than 141 µs after the first loses the fourth. `otg_fs` (2) may wait: USB can NAK.
+    #[task(binds = CAN1_RX1, priority = 4, local = [can1_reopener], shared = [tap, &can1_entered])]
+    fn can1_drain(mut cx: can1_drain::Context) {
+        let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], stamp }| {
             capture.on_receive(Channel::Can1, can1, stamp, entered);
         });
+        cx.local.can1_reopener.open();
     }
 
-    /// As [`can1_rx0`], for CAN2. When both come at once this one waits for the other's few microseconds.
-    #[task(binds = CAN2_RX0, priority = 4, local = [can2_clock], shared = [tap])]
-    fn can2_rx0(mut cx: can2_rx0::Context) {
-        let entered = cx.local.can2_clock.now();
+    /// As [`can1_drain`], for CAN2.
+    #[task(binds = CAN2_RX1, priority = 4, local = [can2_reopener], shared = [tap, &can2_entered])]
+    fn can2_drain(mut cx: can2_drain::Context) {
+        let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
             capture.on_receive(Channel::Can2, can2, stamp, entered);
         });
+        cx.local.can2_reopener.open();
     }
 
     /// Confirms what CAN1 has sent and fills its mailboxes again.

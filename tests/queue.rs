@@ -44,7 +44,8 @@ fn check(pace: impl Fn(u32)) -> u32 {
         loop {
             let ended = done.load(Ordering::Acquire);
             let used = consumer.read(|bytes| {
-                let (record, ticks, rest) = record::decode(bytes).expect("only whole records are in the queue");
+                let (record, ticks, rest) =
+                    record::decode(bytes).expect("only whole records are in the queue");
                 time += i64::from(ticks);
                 match record {
                     Record::Received(received) => {
@@ -53,7 +54,12 @@ fn check(pace: impl Fn(u32)) -> u32 {
                         *number += 2;
                         read += 1;
                     }
-                    Record::Event(Event::Lost { channel, stage: LossStage::Queue, count, at_least: false }) => {
+                    Record::Event(Event::Lost {
+                        channel,
+                        stage: LossStage::Queue,
+                        count,
+                        at_least: false,
+                    }) => {
                         next[channel.index()] += 2 * count;
                         lost[channel.index()] += count;
                     }

@@ -32,6 +32,10 @@ pub struct Controllers {
     pub control: [CanControl; CHANNELS],
     /// For commands.
     pub filters: CanFilters,
+    /// For the interrupts that stamp, one each.
+    pub doorbells: [Doorbell; CHANNELS],
+    /// For the tasks that drain, one each.
+    pub reopeners: [Doorbell; CHANNELS],
 }
 
 impl Controllers {
@@ -49,6 +53,8 @@ impl Controllers {
             traffic: blocks.map(CanTraffic::new),
             control,
             filters: CanFilters { can1: Registers(CAN1::ptr()) },
+            doorbells: blocks.map(|can| Doorbell { can }),
+            reopeners: blocks.map(|can| Doorbell { can }),
         }
     }
 }
@@ -68,6 +74,29 @@ impl Deref for Registers {
     fn deref(&self) -> &RegisterBlock {
         // SAFETY: the pointer is one of the PAC's, made from a peripheral that `Controllers::new` took.
         unsafe { &*self.0 }
+    }
+}
+
+/// The switch of a controller's receive interrupt. The interrupt silences it and leaves the FIFO to a task of lower
+/// priority, which switches it on again when the FIFO is empty. So between the two only one of them ever runs, and
+/// IER, which commands write only while the controller is off the bus, has one writer at a time.
+pub struct Doorbell {
+    can: Registers,
+}
+
+impl Doorbell {
+    /// Ends the interrupt though frames are waiting.
+    #[inline]
+    pub fn silence(&self) {
+        self.can.ier().modify(|_, w| w.fmpie0().clear_bit().fovie0().clear_bit());
+        // Read back, so that the line has fallen before the interrupt returns.
+        self.can.ier().read();
+    }
+
+    /// Interrupts again: at once if a frame is waiting.
+    #[inline]
+    pub fn open(&self) {
+        self.can.ier().modify(|_, w| w.fmpie0().set_bit().fovie0().set_bit());
     }
 }
 
@@ -262,7 +291,7 @@ fn received_id(rir: &rir::R) -> Id {
     }
 }
 
-/// A controller's control half. It alone writes MCR, IER and BTR.
+/// A controller's control half. It alone writes MCR and BTR, and IER while the controller is off the bus.
 pub struct CanControl {
     can: Registers,
 }

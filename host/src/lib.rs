@@ -11,12 +11,16 @@ pub mod playback;
 pub mod plot;
 #[cfg(feature = "signals")]
 pub mod signals;
+#[cfg(feature = "virtual")]
+pub mod simbus;
 pub mod socketcan;
 #[cfg(feature = "stats")]
 pub mod stats;
 #[cfg(test)]
 mod testing;
 pub mod trace;
+#[cfg(feature = "virtual")]
+pub mod virtual_device;
 
 pub use bits::{FrameBits, bits_on_bus};
 pub use cantap_wire as wire;

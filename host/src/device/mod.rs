@@ -406,6 +406,14 @@ fn connect(address: &Address) -> Result<Link, DeviceError> {
         Address::Serial(port) => serial::open(port),
         #[cfg(not(feature = "serial"))]
         Address::Serial(_) => not_built(address, "serial"),
+        #[cfg(feature = "virtual")]
+        Address::Virtual(options) => {
+            let options = options.parse().map_err(|error: crate::virtual_device::BadOption| {
+                DeviceError::BadAddress { address: address.to_string(), reason: error.to_string() }
+            })?;
+            Ok(crate::virtual_device::start(options)?.into_link())
+        }
+        #[cfg(not(feature = "virtual"))]
         Address::Virtual(_) => not_built(address, "virtual"),
         Address::Emulated(_) => not_built(address, "emu"),
     }

@@ -1,0 +1,416 @@
+//! A model of bxCAN at the level of the firmware's traits: FIFO, mailboxes, modes, fault confinement, filters.
+//!
+//! One controller has three faces: the firmware's traffic and control sides, and a node on a simulated bus.
+
+use std::cell::RefCell;
+use std::collections::VecDeque;
+use std::rc::Rc;
+
+use cantap_firmware::CAN_CLOCK_HZ;
+use cantap_firmware::filters::{Bank, Shape};
+use cantap_firmware::ports::{Control, ErrorStatus, Outcome, Traffic};
+use cantap_firmware::transmit::MAILBOXES;
+use cantap_wire::Frame;
+use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
+use cantap_wire::record::{BusErrorKind, ErrorState};
+
+use crate::simbus::Node;
+
+/// Frames that a receive FIFO holds (RM0090 Rev 21 §32.7.3).
+const FIFO_FRAMES: usize = 3;
+/// Error counters at which fault confinement changes (ISO 11898-1:2015, 12.1.4).
+const WARNING: u16 = 96;
+const PASSIVE: u16 = 128;
+const BUS_OFF: u16 = 256;
+/// Bits that a controller waits in bus-off: 128 times 11 recessive ones.
+const RECOVERY_BITS: u64 = 128 * 11;
+
+/// Where a controller is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    Off,
+    /// Joins when no frame is on the bus.
+    Joining,
+    On,
+    /// Leaves when no frame is on the bus.
+    Leaving,
+}
+
+/// What the controller asks the processor for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Interrupts {
+    pub receive: bool,
+    pub transmit: bool,
+    pub error: bool,
+}
+
+/// One controller.
+pub struct Controller {
+    phase: Phase,
+    config: Option<ChannelConfig>,
+    bitrate_bps: u32,
+    filters: Vec<Bank>,
+    fifo: VecDeque<Frame>,
+    overrun: bool,
+    mailboxes: [Option<Frame>; MAILBOXES],
+    /// Mailboxes in the order in which they were filled.
+    order: VecDeque<u8>,
+    finished: VecDeque<(u8, Outcome)>,
+    /// The first of `order` is on the bus.
+    sending: bool,
+    aborting: bool,
+    tec: u16,
+    rec: u16,
+    error: Option<BusErrorKind>,
+    last_error: u32,
+    /// Left to wait in bus-off, in nanoseconds of model time at which it ends; set by the machine.
+    recovers_at_ns: Option<u64>,
+    /// Set when something happened, taken by the machine.
+    pub interrupts: Interrupts,
+    /// Frames on the bus that passed the filters while the controller took part, delivered to the FIFO or not.
+    pub heard: u64,
+}
+
+impl Controller {
+    pub fn new() -> Self {
+        Self {
+            phase: Phase::Off,
+            config: None,
+            bitrate_bps: 0,
+            filters: vec![Bank::ALL],
+            fifo: VecDeque::with_capacity(FIFO_FRAMES),
+            overrun: false,
+            mailboxes: [None; MAILBOXES],
+            order: VecDeque::with_capacity(MAILBOXES),
+            finished: VecDeque::with_capacity(MAILBOXES),
+            sending: false,
+            aborting: false,
+            tec: 0,
+            rec: 0,
+            error: None,
+            last_error: 0,
+            recovers_at_ns: None,
+            interrupts: Interrupts::default(),
+            heard: 0,
+        }
+    }
+
+    /// Whether it plays with itself only.
+    pub fn is_looped(&self) -> bool {
+        matches!(self.mode(), Some(Mode::Loopback | Mode::SilentLoopback))
+    }
+
+    pub fn set_filters(&mut self, filters: Vec<Bank>) {
+        self.filters = filters;
+    }
+
+    /// Called as time passes: ends bus-off when its time is over.
+    pub fn pass(&mut self, now_ns: u64) {
+        if self.state() != ErrorState::BusOff || self.config.is_some_and(|config| config.manual_recovery) {
+            return;
+        }
+        let wait_ns = RECOVERY_BITS * 1_000_000_000 / u64::from(self.bitrate_bps.max(1));
+        let at_ns = *self.recovers_at_ns.get_or_insert(now_ns + wait_ns);
+        if now_ns >= at_ns {
+            self.clear_errors();
+            self.interrupts.error = true;
+        }
+    }
+
+    fn clear_errors(&mut self) {
+        self.tec = 0;
+        self.rec = 0;
+        self.recovers_at_ns = None;
+    }
+
+    fn mode(&self) -> Option<Mode> {
+        self.config.map(|config| config.mode)
+    }
+
+    fn takes_part(&self) -> bool {
+        matches!(self.phase, Phase::On | Phase::Leaving)
+    }
+
+    fn state(&self) -> ErrorState {
+        match self.tec.max(self.rec) {
+            _ if self.tec >= BUS_OFF => ErrorState::BusOff,
+            PASSIVE.. => ErrorState::Passive,
+            WARNING.. => ErrorState::Warning,
+            _ => ErrorState::Active,
+        }
+    }
+
+    fn passes(&self, frame: &Frame) -> bool {
+        self.filters.iter().any(|bank| bank_passes(bank, frame))
+    }
+
+    fn receive_from_bus(&mut self, frame: &Frame) {
+        if !self.passes(frame) {
+            return;
+        }
+        self.heard += 1;
+        if self.fifo.len() < FIFO_FRAMES {
+            self.fifo.push_back(*frame);
+        } else {
+            self.overrun = true;
+        }
+        self.interrupts.receive = true;
+    }
+
+    fn finish_first(&mut self, outcome: Outcome) {
+        if let Some(mailbox) = self.order.pop_front() {
+            self.mailboxes[usize::from(mailbox)] = None;
+            self.finished.push_back((mailbox, outcome));
+            self.interrupts.transmit = true;
+        }
+    }
+
+    fn abort_waiting(&mut self) {
+        let keep = usize::from(self.sending);
+        while self.order.len() > keep {
+            if let Some(mailbox) = self.order.pop_back() {
+                self.mailboxes[usize::from(mailbox)] = None;
+                self.finished.push_back((mailbox, Outcome::Aborted));
+                self.interrupts.transmit = true;
+            }
+        }
+    }
+
+    fn leave(&mut self) {
+        self.phase = Phase::Off;
+        self.sending = false;
+        self.aborting = false;
+        self.abort_waiting();
+    }
+
+    fn count_error(&mut self, kind: BusErrorKind, own: bool) {
+        self.error = Some(kind);
+        self.last_error = error_code(kind);
+        self.interrupts.error = true;
+        match self.mode() {
+            // A silent controller's counters stand still.
+            Some(Mode::ListenOnly) | None => {}
+            // A passive sender that nobody acknowledges does not count further (ISO 11898-1:2015, 12.1.4.2).
+            Some(_) if own && kind == BusErrorKind::Acknowledgment && self.tec >= PASSIVE => {}
+            Some(_) if own => self.tec = (self.tec + 8).min(BUS_OFF),
+            Some(_) => self.rec = (self.rec + 1).min(PASSIVE),
+        }
+    }
+}
+
+impl Node for Controller {
+    fn bitrate_bps(&self) -> Option<u32> {
+        (self.phase != Phase::Off && self.state() != ErrorState::BusOff).then_some(self.bitrate_bps)
+    }
+
+    fn bid(&self) -> Option<Frame> {
+        let sends = self.phase == Phase::On && self.state() != ErrorState::BusOff;
+        let first = *self.order.front().filter(|_| sends)?;
+        self.mailboxes[usize::from(first)]
+    }
+
+    fn acknowledges(&self) -> bool {
+        // In loopback the controller is its own audience.
+        self.takes_part() && self.mode().is_some_and(Mode::transmits) || self.is_looped()
+    }
+
+    fn on_start(&mut self) {
+        self.sending = true;
+    }
+
+    fn on_lost(&mut self) {
+        if self.aborting {
+            self.aborting = false;
+            self.finish_first(Outcome::Aborted);
+        } else if self.config.is_some_and(|config| config.one_shot) {
+            self.finish_first(Outcome::ArbitrationLost);
+        }
+    }
+
+    fn on_frame(&mut self, frame: &Frame, own: bool) {
+        if !self.takes_part() {
+            return;
+        }
+        if own {
+            self.sending = false;
+            self.aborting = false;
+            self.tec = self.tec.saturating_sub(1);
+            self.finish_first(Outcome::Sent);
+        } else {
+            self.rec = if self.rec > PASSIVE - 1 { PASSIVE - 9 } else { self.rec.saturating_sub(1) };
+        }
+        if !own || self.is_looped() {
+            self.receive_from_bus(frame);
+        }
+    }
+
+    fn on_error(&mut self, kind: BusErrorKind, own: bool) {
+        if !self.takes_part() {
+            return;
+        }
+        self.count_error(kind, own);
+        if own {
+            self.sending = false;
+            let one_shot = self.config.is_some_and(|config| config.one_shot);
+            if std::mem::take(&mut self.aborting) {
+                self.finish_first(Outcome::Aborted);
+            } else if one_shot || self.state() == ErrorState::BusOff {
+                self.finish_first(Outcome::Error);
+            }
+        }
+    }
+
+    fn on_boundary(&mut self) {
+        match self.phase {
+            Phase::Joining => self.phase = Phase::On,
+            Phase::Leaving => self.leave(),
+            Phase::On | Phase::Off => {}
+        }
+    }
+}
+
+/// The firmware's traffic side of a controller.
+pub struct TrafficSide(pub Rc<RefCell<Controller>>);
+
+impl Traffic for TrafficSide {
+    fn pending(&self) -> u8 {
+        self.0.borrow().fifo.len() as u8
+    }
+
+    fn receive(&mut self) -> Option<Frame> {
+        self.0.borrow_mut().fifo.pop_front()
+    }
+
+    fn take_overrun(&mut self) -> bool {
+        std::mem::take(&mut self.0.borrow_mut().overrun)
+    }
+
+    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+        let mut controller = self.0.borrow_mut();
+        let taken = |mailbox: usize| {
+            controller.mailboxes[mailbox].is_some()
+                || controller.finished.iter().any(|(finished, _)| usize::from(*finished) == mailbox)
+        };
+        let free = (0..MAILBOXES).find(|mailbox| !taken(*mailbox))?;
+        controller.mailboxes[free] = Some(*frame);
+        controller.order.push_back(free as u8);
+        Some(free as u8)
+    }
+
+    fn take_finished(&mut self) -> Option<(u8, Outcome)> {
+        self.0.borrow_mut().finished.pop_front()
+    }
+
+    fn abort(&mut self) {
+        let mut controller = self.0.borrow_mut();
+        controller.aborting = controller.sending;
+        controller.abort_waiting();
+    }
+
+    fn take_errors(&mut self) -> ErrorStatus {
+        let mut controller = self.0.borrow_mut();
+        ErrorStatus {
+            kind: controller.error.take(),
+            state: controller.state(),
+            tec: controller.tec.min(255) as u8,
+            rec: controller.rec.min(255) as u8,
+        }
+    }
+
+    fn registers(&self) -> RegisterSet {
+        let controller = self.0.borrow();
+        let state = controller.state();
+        // RM0090 Rev 21 §32.9.2; only what this model knows.
+        let esr = u32::from(state >= ErrorState::Warning)
+            | u32::from(state >= ErrorState::Passive) << 1
+            | u32::from(state == ErrorState::BusOff) << 2
+            | controller.last_error << 4
+            | u32::from(controller.tec.min(255)) << 16
+            | u32::from(controller.rec.min(255)) << 24;
+        let rf0r = controller.fifo.len() as u32 | u32::from(controller.overrun) << 4;
+        let stopped = u32::from(controller.phase == Phase::Off);
+        let btr = controller.config.map_or(0, |config| {
+            let timing = config.timing;
+            let (silent, looped) = match config.mode {
+                Mode::Normal => (0, 0),
+                Mode::ListenOnly => (1, 0),
+                Mode::Loopback => (0, 1),
+                Mode::SilentLoopback => (1, 1),
+            };
+            silent << 31
+                | looped << 30
+                | u32::from(timing.jump_width - 1) << 24
+                | u32::from(timing.segment2 - 1) << 20
+                | u32::from(timing.segment1 - 1) << 16
+                | u32::from(timing.prescaler - 1)
+        });
+        RegisterSet { mcr: stopped, msr: stopped, rf0r, esr, btr, ..RegisterSet::default() }
+    }
+}
+
+/// The firmware's control side of a controller.
+pub struct ControlSide(pub Rc<RefCell<Controller>>);
+
+impl Control for ControlSide {
+    fn stop(&mut self) {
+        let mut controller = self.0.borrow_mut();
+        match controller.phase {
+            Phase::On => controller.phase = Phase::Leaving,
+            Phase::Joining => controller.phase = Phase::Off,
+            Phase::Off | Phase::Leaving => {}
+        }
+    }
+
+    fn halt(&mut self) {
+        self.0.borrow_mut().leave();
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.0.borrow().phase == Phase::Off
+    }
+
+    fn start(&mut self, config: &ChannelConfig) {
+        let mut controller = self.0.borrow_mut();
+        controller.bitrate_bps = config.timing.bitrate_bps(CAN_CLOCK_HZ);
+        controller.config = Some(*config);
+        controller.fifo.clear();
+        controller.overrun = false;
+        controller.error = None;
+        controller.clear_errors();
+        controller.phase = Phase::Joining;
+    }
+
+    fn resume(&mut self) {
+        let mut controller = self.0.borrow_mut();
+        controller.clear_errors();
+        controller.phase = Phase::Joining;
+    }
+}
+
+/// The last-error code of bxCAN's ESR (RM0090 Rev 21 §32.9.2).
+const fn error_code(kind: BusErrorKind) -> u32 {
+    match kind {
+        BusErrorKind::Stuff => 1,
+        BusErrorKind::Form => 2,
+        BusErrorKind::Acknowledgment => 3,
+        BusErrorKind::BitRecessive => 4,
+        BusErrorKind::BitDominant => 5,
+        BusErrorKind::Crc => 6,
+    }
+}
+
+/// Whether a filter bank lets a frame pass (RM0090 Rev 21 §32.7.4).
+fn bank_passes(bank: &Bank, frame: &Frame) -> bool {
+    let (id, extended, remote) = (frame.id().raw(), frame.id().is_extended(), u32::from(frame.is_remote()));
+    let standard_part = if extended { id >> 18 } else { id };
+    let wide = if extended { id << 3 | 1 << 2 } else { id << 21 } | remote << 1;
+    let extended_part = if extended { id >> 15 & 7 } else { 0 };
+    let narrow = standard_part << 5 | remote << 4 | u32::from(extended) << 3 | extended_part;
+    let halves = [bank.first & 0xFFFF, bank.first >> 16, bank.second & 0xFFFF, bank.second >> 16];
+    match bank.shape {
+        Shape::Mask32 => (wide ^ bank.first) & bank.second == 0,
+        Shape::List32 => [bank.first, bank.second].contains(&wide),
+        Shape::Mask16 => (narrow ^ halves[0]) & halves[1] == 0 || (narrow ^ halves[2]) & halves[3] == 0,
+        Shape::List16 => halves.contains(&narrow),
+    }
+}

@@ -1,0 +1,23 @@
+//! A device without a board: the firmware's own logic, natively, on a simulated bus.
+//!
+//! It proves the logic and the host, in real time or as fast as possible. It does not prove interrupts,
+//! registers or USB: every interrupt is served at once, so stamps are exact and the controllers' FIFOs never
+//! overrun. USB is a pipe that carries no more than the bus would.
+//!
+//! Model time never depends on when the operating system runs the thread: bus, firmware and USB advance
+//! together, in steps that follow the wall clock. A thread that was held up catches up, and gives the host the
+//! time to read that it missed as well.
+
+mod board;
+mod controller;
+mod machine;
+mod options;
+#[cfg(all(unix, feature = "serial"))]
+mod pty;
+mod runner;
+
+pub use machine::{Heard, Witness};
+pub use options::{BadOption, Options, Pace};
+#[cfg(all(unix, feature = "serial"))]
+pub use pty::{Terminal, open_terminal};
+pub use runner::{Connection, VirtualDevice, start};

@@ -1,0 +1,255 @@
+//! The device handle against the firmware's own logic on a simulated bus.
+#![cfg(feature = "virtual")]
+
+use std::io::Read;
+use std::time::{Duration, Instant};
+
+use cantap::device::{Device, Link};
+use cantap::simbus::{FrameSource, Frames};
+use cantap::virtual_device::{Options, Pace, start};
+use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Mode, TxFrame};
+use cantap::wire::record::{BusErrorKind, ErrorState, TransmitFailure};
+use cantap::{Channel, Direction, Frame, TraceEvent, TraceRecord};
+
+const BITRATE: u32 = 1_000_000;
+
+fn options(load_percent: f64, frames: Frames) -> Options {
+    Options { load_percent, frames, pace: Pace::Fast, ..Options::default() }
+}
+
+fn open(options: Options) -> Device {
+    Device::over(start(options).unwrap().into_link(), "virtual").unwrap()
+}
+
+fn config(device: &Device, mode: Mode) -> ChannelConfig {
+    let timing = device.timing(BITRATE).unwrap();
+    ChannelConfig { mode, ..ChannelConfig::listen_only(timing) }
+}
+
+/// Takes records, in whole batches, until `enough` says so; fails after ten seconds.
+fn collect(device: &Device, mut enough: impl FnMut(&TraceRecord) -> bool) -> Vec<TraceRecord> {
+    let mut records = device.records();
+    let mut taken = Vec::new();
+    let deadline = Instant::now() + Duration::from_secs(10);
+    while Instant::now() < deadline {
+        let batch = records.next_batch(Duration::from_millis(100)).unwrap().unwrap_or_default();
+        let done = batch.iter().any(&mut enough);
+        taken.extend(batch);
+        if done {
+            return taken;
+        }
+    }
+    panic!("{} records and not what was waited for", taken.len());
+}
+
+/// Holds each channel's records against the sequence that was sent: a frame must be the next, a loss counts as
+/// so many. Returns delivered and lost.
+fn check_law(records: &[TraceRecord], options: &Options, heard: [u64; 2]) -> ([u64; 2], [u64; 2]) {
+    let mut sources: [FrameSource; 2] = [options.source(0), options.source(1)];
+    let (mut delivered, mut lost) = ([0; 2], [0; 2]);
+    for record in records {
+        let channel = usize::from(record.channel - 1);
+        match record.event {
+            TraceEvent::Frame { frame, .. } => {
+                assert_eq!(Some(frame), sources[channel].next(), "channel {}", record.channel);
+                delivered[channel] += 1;
+            }
+            TraceEvent::Lost { count, at_least: false, .. } if count > 0 => {
+                sources[channel].nth(count as usize - 1);
+                lost[channel] += u64::from(count);
+            }
+            ref other => panic!("{other:?}"),
+        }
+    }
+    for channel in 0..2 {
+        assert_eq!(delivered[channel] + lost[channel], heard[channel]);
+    }
+    (delivered, lost)
+}
+
+#[test]
+fn both_channels_saturated_arrive_complete_in_order_and_spaced_by_their_lengths() {
+    for frames in [Frames::Std0, Frames::Mix, Frames::Ext8, Frames::Rtr] {
+        let options = options(100.0, frames);
+        let connection = start(options.clone()).unwrap();
+        let witness = connection.witness.clone();
+        let device = Device::over(connection.into_link(), "virtual").unwrap();
+        for channel in Channel::ALL {
+            device.listen(channel, BITRATE).unwrap();
+        }
+        let mut count = 0;
+        let mut records = collect(&device, |_| {
+            count += 1;
+            count == 20_000
+        });
+        device.stop().unwrap();
+        records.extend(device.records().map(Result::unwrap));
+        let (delivered, lost) = check_law(&records, &options, witness.heard().frames);
+        assert!(delivered.iter().all(|count| *count > 5000));
+        assert_eq!(lost, [0; 2]);
+        assert!(records.is_sorted_by_key(|record| record.time_ns));
+        for channel in [1, 2] {
+            let on_channel: Vec<&TraceRecord> =
+                records.iter().filter(|record| record.channel == channel).collect();
+            for pair in on_channel.windows(2) {
+                let bits = cantap::bits_on_bus(pair[1].frame().unwrap());
+                let spacing = pair[1].time_ns - pair[0].time_ns;
+                assert!((spacing - i64::from(bits) * 1000).abs() <= 170, "{bits} bits in {spacing} ns");
+            }
+        }
+    }
+}
+
+/// Reads nothing for a while, once.
+struct Stalling<R> {
+    inner: R,
+    from: Instant,
+    length: Duration,
+}
+
+impl<R: Read> Read for Stalling<R> {
+    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
+        if self.from.elapsed() > Duration::ZERO && !self.length.is_zero() && Instant::now() > self.from {
+            std::thread::sleep(std::mem::take(&mut self.length));
+        }
+        self.inner.read(out)
+    }
+}
+
+#[test]
+fn a_host_that_stalls_too_long_loses_frames_and_every_one_is_counted() {
+    let options = Options { pace: Pace::RealTime, ..options(100.0, Frames::Std0) };
+    let connection = start(options.clone()).unwrap();
+    let witness = connection.witness.clone();
+    let reader = Stalling {
+        inner: connection.reader,
+        from: Instant::now() + Duration::from_millis(300),
+        length: Duration::from_millis(1500),
+    };
+    let link = Link::new(reader, connection.writer).keeping(connection.device);
+    let device = Device::over(link, "virtual").unwrap();
+    for channel in Channel::ALL {
+        device.listen(channel, BITRATE).unwrap();
+    }
+    std::thread::sleep(Duration::from_millis(2200));
+    let status = device.stop().unwrap();
+    let records: Vec<TraceRecord> = device.records().map(Result::unwrap).collect();
+    let (_, lost) = check_law(&records, &options, witness.heard().frames);
+    assert!(lost.iter().all(|count| *count > 1000), "{lost:?}");
+    assert_eq!(status.channels.map(|channel| u64::from(channel.lost_queue)), lost);
+    assert!(status.queue_high_water_bytes > 90_000);
+}
+
+#[test]
+fn frames_are_sent_confirmed_and_lose_arbitration_to_lower_identifiers() {
+    let device = open(Options { pace: Pace::RealTime, ..options(30.0, Frames::Std8) });
+    let transmissions = device.transmissions();
+    device.open_channel(Channel::Can1, Some(config(&device, Mode::Normal))).unwrap();
+    let frame: Frame = "7FF#DEADBEEF".parse().unwrap();
+    device.send(Channel::Can1, &[TxFrame { tag: 42, frame, at_ticks: None }]).unwrap();
+    let sent = transmissions.recv_timeout(Duration::from_secs(5)).unwrap();
+    assert_eq!((sent.channel, sent.tag, sent.result), (Channel::Can1, 42, Ok(frame)));
+    collect(&device, |record| {
+        record.event == TraceEvent::Frame { frame, direction: Direction::Tx, late: false }
+    });
+    let refused = device.send(Channel::Can2, &[TxFrame { tag: 1, frame, at_ticks: None }]).unwrap_err();
+    assert_eq!(refused.to_string(), "the device refused: the channel is closed; open it first");
+}
+
+#[test]
+fn in_loopback_a_device_hears_itself_and_nothing_of_the_bus() {
+    let device = open(options(100.0, Frames::Std8));
+    device.open_channel(Channel::Can2, Some(config(&device, Mode::SilentLoopback))).unwrap();
+    let frame: Frame = "123#R3".parse().unwrap();
+    device.send(Channel::Can2, &[TxFrame { tag: 1, frame, at_ticks: None }]).unwrap();
+    let heard = collect(&device, |record| {
+        record.event == TraceEvent::Frame { frame, direction: Direction::Rx, late: false }
+    });
+    assert!(heard.len() <= 2, "{heard:?}");
+}
+
+#[test]
+fn two_channels_on_one_wire_hear_each_other() {
+    let device = open(Options { joined: true, ..options(0.0, Frames::Std8) });
+    for channel in Channel::ALL {
+        device.open_channel(channel, Some(config(&device, Mode::Normal))).unwrap();
+    }
+    let frame: Frame = "1F334455#1122334455667788".parse().unwrap();
+    device.send(Channel::Can1, &[TxFrame { tag: 1, frame, at_ticks: None }]).unwrap();
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+    collect(&device, |record| record.channel == 2 && record.event == event);
+}
+
+#[test]
+fn the_wrong_bit_rate_shows_as_bus_errors() {
+    let device = open(Options { bitrate_bps: Some(250_000), ..options(50.0, Frames::Std8) });
+    device.listen(Channel::Can1, BITRATE).unwrap();
+    collect(&device, |record| {
+        matches!(record.event, TraceEvent::BusError { kind: Some(BusErrorKind::Stuff), .. })
+    });
+    let status = device.status().unwrap();
+    assert_eq!(status.channels[0].frames, 0);
+    // A silent controller's counters stand still.
+    assert_eq!((status.channels[0].tec, status.channels[0].rec), (0, 0));
+}
+
+#[test]
+fn without_an_acknowledge_a_sender_becomes_passive_and_aborts_on_request() {
+    let device = open(Options { acknowledge: false, ..options(0.0, Frames::Std8) });
+    device.open_channel(Channel::Can1, Some(config(&device, Mode::Normal))).unwrap();
+    let frame: Frame = "100#01".parse().unwrap();
+    device.send(Channel::Can1, &[TxFrame { tag: 7, frame, at_ticks: None }]).unwrap();
+    collect(&device, |record| matches!(record.event, TraceEvent::State { state: ErrorState::Passive, .. }));
+    device.abort(Channel::Can1).unwrap();
+    let aborted = TraceEvent::TransmitFailed { tag: 7, reason: TransmitFailure::Aborted };
+    collect(&device, |record| record.event == aborted);
+}
+
+#[test]
+fn filters_let_pass_what_they_should_and_nothing_else() {
+    let device = open(options(80.0, Frames::Mix));
+    let filters = [
+        Filter { extended: false, kind: FrameKind::Data, id: 0x123, mask: 0x70F },
+        Filter { extended: true, kind: FrameKind::Any, id: 0x0000_0001, mask: 0x0000_0003 },
+    ];
+    device.set_filters(Channel::Can1, &filters).unwrap();
+    device.listen(Channel::Can1, BITRATE).unwrap();
+    let mut seen = [0; 2];
+    let records = collect(&device, |record| {
+        for (seen, filter) in seen.iter_mut().zip(&filters) {
+            *seen += usize::from(record.frame().is_some_and(|frame| filter.matches(frame)));
+        }
+        seen.iter().all(|count| *count > 20)
+    });
+    for record in records {
+        let frame = *record.frame().unwrap();
+        assert!(filters.iter().any(|filter| filter.matches(&frame)), "{frame}");
+    }
+}
+
+#[cfg(all(unix, feature = "serial"))]
+#[test]
+fn behind_a_pseudo_terminal_it_is_a_serial_port_and_can_be_opened_again() {
+    use cantap::device::Address;
+    let terminal = cantap::virtual_device::open_terminal(Options {
+        pace: Pace::RealTime,
+        ..options(60.0, Frames::Std8)
+    })
+    .unwrap();
+    let address: Address = terminal.path().parse().unwrap();
+    for _ in 0..3 {
+        let device = Device::open(&address).unwrap();
+        assert!(matches!(Device::open(&address), Err(cantap::DeviceError::Busy { .. })));
+        device.listen(Channel::Can1, BITRATE).unwrap();
+        let mut count = 0;
+        collect(&device, |_| {
+            count += 1;
+            count == 500
+        });
+        let status = device.stop().unwrap();
+        assert!(status.channels[0].frames >= 500);
+        assert_eq!(device.counters().channels[0].lost(), 0);
+    }
+    drop(terminal);
+    assert!(Device::open(&address).is_err());
+}

@@ -22,7 +22,8 @@ use stm32f4xx_hal::rcc::{Config, Rcc};
 use crate::board::{self, Ports};
 
 /// The protocol's version, for those who load the ELF ([`cantap_wire::PROTOCOL_SYMBOL`]).
-// SAFETY: no other symbol has this name.
+// SAFETY: no other symbol has this name. `used`, because nothing in the firmware reads it.
+#[used]
 #[unsafe(no_mangle)]
 static CANTAP_PROTOCOL_VERSION: u16 = cantap_wire::PROTOCOL_VERSION;
 

@@ -1,5 +1,9 @@
 //! Values on the command line that several commands share.
 
+use std::time::Duration;
+
+use cantap::Channel;
+
 /// A bit rate in bit/s: `500000`, `500k`, `83.333k`, `1M`.
 pub fn bitrate(text: &str) -> Result<u32, String> {
     let (number, factor) = match text.as_bytes().last() {
@@ -14,9 +18,68 @@ pub fn bitrate(text: &str) -> Result<u32, String> {
     if (1.0..=f64::from(u32::MAX)).contains(&bps) { Ok(bps as u32) } else { Err(wrong()) }
 }
 
+/// A time: `400ms`, `3s`, `250us`, `2m`, `1h`, or a number of seconds.
+pub fn duration(text: &str) -> Result<Duration, String> {
+    let unit_at = text.find(|symbol: char| symbol.is_ascii_alphabetic()).unwrap_or(text.len());
+    let (number, unit) = text.split_at(unit_at);
+    let seconds = match unit {
+        "us" => 1e-6,
+        "ms" => 1e-3,
+        "" | "s" => 1.0,
+        "m" | "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err("write a time with its unit, such as 400ms, 3s or 2m".to_owned()),
+    };
+    number
+        .trim_end()
+        .parse::<f64>()
+        .ok()
+        .and_then(|value| Duration::try_from_secs_f64(value * seconds).ok())
+        .ok_or_else(|| "write a time as a number and a unit, such as 400ms, 3s or 2m".to_owned())
+}
+
+/// Channels of a device, as `1`, `2` or `both`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Channels(&'static [Channel]);
+
+impl Channels {
+    /// One by one.
+    pub fn iter(self) -> impl Iterator<Item = Channel> {
+        self.0.iter().copied()
+    }
+}
+
+/// See [`Channels`].
+pub fn channels(text: &str) -> Result<Channels, String> {
+    match text {
+        "1" => Ok(Channels(&[Channel::Can1])),
+        "2" => Ok(Channels(&[Channel::Can2])),
+        "both" => Ok(Channels(&Channel::ALL)),
+        _ => Err("a channel is 1, 2 or both".to_owned()),
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn times_need_a_known_unit() {
+        assert_eq!(duration("400ms"), Ok(Duration::from_millis(400)));
+        assert_eq!(duration("1.5"), Ok(Duration::from_millis(1500)));
+        assert_eq!(duration("2m"), Ok(Duration::from_mins(2)));
+        for text in ["", "ms", "-1s", "3 weeks", "1e400", "nan"] {
+            assert!(duration(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn channels_are_one_two_or_both() {
+        let numbers = |text| channels(text).map(|channels| channels.iter().map(Channel::number).collect());
+        assert_eq!(numbers("2"), Ok(vec![2]));
+        assert_eq!(numbers("both"), Ok(vec![1, 2]));
+        assert_eq!(numbers("3"), Err("a channel is 1, 2 or both".to_owned()));
+    }
 
     #[test]
     fn bit_rates_take_can_users_units() {

@@ -4,6 +4,7 @@ mod args;
 mod commands;
 mod databases;
 mod input;
+mod interrupt;
 
 use std::process::ExitCode;
 

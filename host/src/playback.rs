@@ -84,7 +84,7 @@ where
                 return Ok(Due::Ended);
             }
             self.start_over(now)?;
-            return self.poll_next(now);
+            return Ok(self.poll_next(now));
         };
         if self.steps > 0 {
             self.steps -= 1;
@@ -93,15 +93,15 @@ where
             self.anchor(record.time_ns, now);
             return Ok(Due::Record(record));
         }
-        self.poll_next(now)
+        Ok(self.poll_next(now))
     }
 
-    fn poll_next(&mut self, now: Duration) -> Result<Due, E> {
+    fn poll_next(&mut self, now: Duration) -> Due {
         let Some(record) = self.next else {
-            return Ok(Due::Ended);
+            return Due::Ended;
         };
         if self.paused {
-            return Ok(Due::Paused);
+            return Due::Paused;
         }
         // A clock that was set back in the trace must not stop it, nor one that was set ahead.
         let ahead = record.time_ns.saturating_sub(self.last_ns.unwrap_or(self.anchor_trace_ns));
@@ -115,9 +115,9 @@ where
         let due = self.due_at(record.time_ns);
         if due <= now {
             self.take(record);
-            return Ok(Due::Record(record));
+            return Due::Record(record);
         }
-        Ok(Due::Wait(due.saturating_sub(now)))
+        Due::Wait(due.saturating_sub(now))
     }
 
     fn take(&mut self, record: TraceRecord) {

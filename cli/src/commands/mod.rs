@@ -2,6 +2,7 @@
 
 pub mod bits;
 pub mod decode;
+pub mod stats;
 
 use std::process::ExitCode;
 
@@ -10,6 +11,8 @@ use std::process::ExitCode;
 pub enum Command {
     /// Show a frame's exact length on the bus, stuff bits and CRC.
     Bits(bits::Args),
+    /// Measure a trace or a bus: load, rates, periods, losses, errors.
+    Stats(stats::Args),
     /// Show a trace as signals, by DBC or signal file.
     Decode(decode::Args),
 }
@@ -19,6 +22,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Bits(args) => bits::run(&args),
+            Self::Stats(args) => stats::run(&args),
             Self::Decode(args) => decode::run(&args),
         }
     }

@@ -51,6 +51,9 @@ pub struct ChannelStatistics {
     latest_ns: i64,
     gaps: u32,
     first_bits: u64,
+    latest_frame_ns: Option<i64>,
+    /// Time between frames, where it went forward.
+    covered_ns: u64,
 }
 
 /// Errors that a channel's controller saw.
@@ -133,6 +136,8 @@ impl ChannelStatistics {
             latest_ns: i64::MIN,
             gaps: 0,
             first_bits: 0,
+            latest_frame_ns: None,
+            covered_ns: 0,
         }
     }
 
@@ -203,6 +208,9 @@ impl ChannelStatistics {
             self.first_bits = u64::from(bits);
         }
         let (first, last) = self.span_ns.unwrap_or((end_ns, end_ns));
+        let interval = self.latest_frame_ns.map_or(0, |before| end_ns.saturating_sub(before));
+        self.latest_frame_ns = Some(end_ns);
+        self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
         self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
         if let Some(load) = &mut self.load {
             load.frame(end_ns, bits);
@@ -219,9 +227,10 @@ impl ChannelStatistics {
         self.windows.finish(now_ns, closed);
     }
 
-    /// From the end of the first frame to the end of the last, in nanoseconds.
-    pub fn span(&self) -> u64 {
-        self.span_ns.map_or(0, |(first, last)| last.saturating_sub(first).max(0) as u64)
+    /// From the first frame's end to the last one's, in nanoseconds; where the trace's clock was set back (two
+    /// logs were joined), the sum of its parts.
+    pub fn covered_ns(&self) -> u64 {
+        self.covered_ns
     }
 
     /// Bits of the first frame, which lie before [`Self::span_ns`].
@@ -231,7 +240,7 @@ impl ChannelStatistics {
 
     /// Frames per second from the first to the last: intervals over time.
     pub fn frames_per_s(&self) -> f64 {
-        per_second(self.frames.saturating_sub(1), self.span())
+        per_second(self.frames.saturating_sub(1), self.covered_ns)
     }
 
     /// Least, mean and largest load of the whole windows that are over, in per cent; `None` without a bit rate.

@@ -51,7 +51,7 @@ pub struct ChannelSummary {
     pub first_s: Option<f64>,
     /// End of the last frame, in seconds.
     pub last_s: Option<f64>,
-    /// Between the two, in seconds.
+    /// Between the two, in seconds; the sum of its parts where the clock was set back.
     pub duration_s: f64,
     /// Frames per second, from the first to the last.
     pub frames_per_s: f64,
@@ -201,14 +201,15 @@ impl Summary {
         let spans = || statistics.channels().iter().filter_map(|channel| channel.span_ns);
         let first = spans().map(|(first, _)| first).min();
         let last = spans().map(|(_, last)| last).max();
-        let duration_ns = first.zip(last).map_or(0, |(first, last)| last.saturating_sub(first));
+        let together = first.zip(last).map_or(0.0, |(first, last)| seconds(last.saturating_sub(first)));
+        let longest = channels.iter().map(|channel| channel.duration_s).fold(together, f64::max);
         Self {
             frames: channels.iter().map(|channel| channel.frames).sum(),
             lost: channels.iter().map(|channel| channel.lost.total).sum(),
             errors: channels.iter().map(|channel| channel.errors.total).sum(),
             first_s: first.map(seconds),
             last_s: last.map(seconds),
-            duration_s: seconds(duration_ns),
+            duration_s: longest,
             window_s: statistics.window_ns as f64 / 1e9,
             channels,
         }
@@ -229,7 +230,7 @@ impl ChannelSummary {
             window_max_pct: extremes.map(|(.., max)| max),
         });
         // As for frames: the first frame's bits lie before the span.
-        let span = channel.span();
+        let span = channel.covered_ns();
         let bits_per_s = super::load::per_second(channel.bits - channel.first_bits(), span);
         Self {
             channel: channel.number,

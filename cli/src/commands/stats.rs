@@ -1,0 +1,153 @@
+//! `cantap stats`: what a trace or a bus does: load, rates, periods, losses, errors.
+
+mod live;
+mod table;
+
+use std::io::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::str::FromStr;
+use std::time::Duration;
+
+use anyhow::bail;
+use cantap::Address;
+use cantap::stats::{Options, PeakSummary, Statistics, Summary};
+
+use crate::args;
+use crate::input::ReadArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap stats trace.log -b 500k\n  \
+    cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
+    cantap stats -d virtual -b 1M -t 10\n\n\
+A frame's load is its exact length, stuff bits and intermission included, over the time since the frame\n\
+before. Windows also count error frames, with their least length. Where frames were lost, the load is a\n\
+lower bound and says so.")]
+pub struct Args {
+    /// The trace; - for standard input.
+    #[arg(value_name = "FILE", required_unless_present = "device")]
+    input: Option<PathBuf>,
+    /// Listen to a device instead of reading a file, until Ctrl-C.
+    #[arg(short, long, conflicts_with = "input")]
+    device: Option<Address>,
+    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
+    /// repeated. A file has no load without it.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE", required_unless_present = "input")]
+    bitrates: Vec<ChannelBitrate>,
+    /// The device's channel to listen to: 1, 2 or both.
+    #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
+    channel: args::Channels,
+    /// Listen only for so long.
+    #[arg(short = 't', long, value_name = "TIME", requires = "device", value_parser = args::duration)]
+    time: Option<Duration>,
+    /// Length of the windows that peaks are looked for in.
+    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    window: Duration,
+    /// List every window.
+    #[arg(long)]
+    windows: bool,
+    /// List every identifier with count, period, jitter and DLCs.
+    #[arg(short, long)]
+    per_id: bool,
+    /// Print one JSON object, identifiers included.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+/// A bit rate, of one channel or of all that have none of their own.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ChannelBitrate {
+    /// From 1.
+    pub channel: Option<u8>,
+    /// In bit/s.
+    pub bitrate_bps: u32,
+}
+
+impl FromStr for ChannelBitrate {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let Some((channel, bitrate)) = text.split_once(':') else {
+            return Ok(Self { channel: None, bitrate_bps: args::bitrate(text)? });
+        };
+        match channel.parse() {
+            Ok(channel @ 1..) => Ok(Self { channel: Some(channel), bitrate_bps: args::bitrate(bitrate)? }),
+            _ => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
+        }
+    }
+}
+
+impl Args {
+    fn options(&self) -> Options {
+        let own = self.bitrates.iter().filter_map(|rate| Some((rate.channel?, rate.bitrate_bps)));
+        let common = self.bitrates.iter().rev().find(|rate| rate.channel.is_none());
+        Options {
+            bitrate_bps: common.map(|rate| rate.bitrate_bps),
+            channel_bitrate_bps: own.collect(),
+            window: self.window,
+            ..Options::default()
+        }
+    }
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let mut statistics = Statistics::new(args.options())?;
+    let mut windows = Vec::new();
+    if let Some(address) = &args.device {
+        live::run(args, address, &mut statistics, &mut windows)?;
+    } else if let Some(path) = &args.input {
+        let mut records = args.read.open(path)?;
+        let keep = args.windows;
+        let mut closed = |window: &_| {
+            if keep {
+                windows.push(PeakSummary::of(window));
+            }
+        };
+        while let Some(record) = records.next()? {
+            statistics.push_with(&record, &mut closed);
+        }
+        statistics.finish_with(&mut closed);
+    } else {
+        bail!("name a file, or a device with -d");
+    }
+    let summary = statistics.summary();
+    if args.json {
+        print_json(&summary, args.windows.then_some(&windows))?;
+    } else {
+        print(&table::text(&summary, &windows, args.per_id))?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn print_json(summary: &Summary, windows: Option<&Vec<PeakSummary>>) -> anyhow::Result<()> {
+    let mut object = serde_json::to_value(summary)?;
+    if let Some(windows) = windows {
+        object["windows"] = serde_json::to_value(windows)?;
+    }
+    print(&format!("{object}\n"))
+}
+
+/// To standard output, whose reader may have gone.
+fn print(text: &str) -> anyhow::Result<()> {
+    Ok(std::io::stdout().lock().write_all(text.as_bytes())?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_bit_rate_may_name_its_channel() {
+        let parse = |text: &str| text.parse::<ChannelBitrate>().map(|rate| (rate.channel, rate.bitrate_bps));
+        assert_eq!(parse("500k"), Ok((None, 500_000)));
+        assert_eq!(parse("2:83.333k"), Ok((Some(2), 83_333)));
+        for wrong in ["0:500k", "2:", "x:500k", "300:1M", "2:fast"] {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,185 @@
+//! Statistics as text for people.
+
+use std::fmt::Write as _;
+
+use cantap::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
+
+/// Everything, for a terminal of any width above eighty columns.
+pub(super) fn text(summary: &Summary, windows: &[PeakSummary], per_id: bool) -> String {
+    let mut out = String::new();
+    // Writing to a String cannot fail.
+    let _ = writeln!(
+        out,
+        "{} frames in {:.6} s on {} {}, {} lost, {} errors",
+        summary.frames,
+        summary.duration_s,
+        summary.channels.len(),
+        if summary.channels.len() == 1 { "channel" } else { "channels" },
+        summary.lost,
+        summary.errors,
+    );
+    for channel in &summary.channels {
+        channel_text(channel, summary, &mut out);
+        if per_id {
+            ids_text(&channel.ids, &mut out);
+        }
+    }
+    if !windows.is_empty() {
+        out.push_str("\nWindows\n");
+        window_lines(windows, summary.channels.first(), &mut out);
+    }
+    if !per_id && summary.channels.iter().any(|channel| !channel.ids.is_empty()) {
+        out.push_str("\nperiods and jitter of each identifier: --per-id\n");
+    }
+    out
+}
+
+fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
+    let _ = match channel.bitrate {
+        Some(bitrate) => writeln!(out, "\nChannel {} at {bitrate} bit/s", channel.channel),
+        None => {
+            writeln!(out, "\nChannel {}, bit rate unknown: give it with -b for the load", channel.channel)
+        }
+    };
+    let _ = writeln!(
+        out,
+        "  frames    {} ({} standard, {} extended, {} remote, {} sent), {:.1} frames/s",
+        channel.frames,
+        channel.standard,
+        channel.extended,
+        channel.remote,
+        channel.sent,
+        channel.frames_per_s,
+    );
+    let _ = writeln!(
+        out,
+        "  bits      {} with stuff bits and intermission, {:.0} bit/s",
+        channel.bits, channel.bits_per_s
+    );
+    if let Some(load) = &channel.load {
+        let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
+        let bound = if channel.lost.total > 0 { ", a lower bound where frames were lost" } else { "" };
+        let _ = writeln!(
+            out,
+            "  load      mean {}, last {}, highest between two frames {}",
+            percent(load.mean_pct),
+            percent(load.instant_pct),
+            percent(load.instant_max_pct),
+        );
+        let _ = writeln!(
+            out,
+            "  windows   {} s: least {}, mean {}, most {}{bound}",
+            summary.window_s,
+            percent(load.window_min_pct),
+            percent(load.window_mean_pct),
+            percent(load.window_max_pct),
+        );
+    }
+    let errors = &channel.errors;
+    if errors.total > 0 {
+        let kinds = [
+            (errors.stuff, "stuff"),
+            (errors.form, "form"),
+            (errors.acknowledgment, "acknowledgment"),
+            (errors.bit_recessive, "bit recessive"),
+            (errors.bit_dominant, "bit dominant"),
+            (errors.crc, "CRC"),
+            (errors.unknown, "of unknown kind"),
+            (errors.suppressed, "not reported one by one"),
+        ];
+        let _ = writeln!(out, "  errors    {}: {}", errors.total, listed(&kinds));
+    }
+    let lost = &channel.lost;
+    if lost.gaps > 0 {
+        let stages = [
+            (lost.controller, "in the controller"),
+            (lost.queue, "in the device's queue"),
+            (lost.link, "on the way to the host"),
+            (lost.host, "in the host"),
+            (lost.unknown, "somewhere"),
+        ];
+        let least = if lost.at_least { "at least " } else { "" };
+        let _ =
+            writeln!(out, "  lost      {least}{} at {} places: {}", lost.total, lost.gaps, listed(&stages));
+    }
+    if let Some(state) = channel.state {
+        let counters = channel.error_counters;
+        let counters = counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"));
+        let _ = writeln!(out, "  state     {state}{counters}");
+    }
+    if channel.out_of_order > 0 {
+        let _ = writeln!(out, "  times     {} records are older than the one before", channel.out_of_order);
+    }
+    if channel.late > 0 {
+        let _ = writeln!(out, "  times     {} frames have only an upper bound", channel.late);
+    }
+    if channel.transmit_failures > 0 {
+        let _ = writeln!(out, "  sending   {} frames were not sent", channel.transmit_failures);
+    }
+    if !channel.peaks.is_empty() {
+        out.push_str("  busiest windows\n");
+        window_lines(&channel.peaks, Some(channel), out);
+    }
+}
+
+/// The counts above zero with their names.
+fn listed(counts: &[(u64, &str)]) -> String {
+    let some: Vec<_> = counts
+        .iter()
+        .filter(|(count, _)| *count > 0)
+        .map(|(count, name)| format!("{count} {name}"))
+        .collect();
+    some.join(", ")
+}
+
+/// Windows with their start relative to the trace's.
+fn window_lines(windows: &[PeakSummary], reference: Option<&ChannelSummary>, out: &mut String) {
+    let zero = reference.and_then(|channel| channel.first_s).unwrap_or(0.0);
+    for window in windows {
+        let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
+        let _ = write!(
+            out,
+            "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
+            window.channel,
+            window.start_s - zero,
+            window.frames_per_s,
+            window.bits_per_s
+        );
+        if window.errors > 0 {
+            let _ = write!(out, " {} errors", window.errors);
+        }
+        if window.lost > 0 {
+            let _ = write!(out, " {} lost", window.lost);
+        }
+        out.push('\n');
+    }
+}
+
+fn ids_text(ids: &[IdSummary], out: &mut String) {
+    let _ = writeln!(
+        out,
+        "  {:<8} {:>9} {:>10} {:>10} {:>10} {:>10} {:>7}  DLC",
+        "ID", "count", "min ms", "mean ms", "max ms", "jitter ms", "share"
+    );
+    for id in ids {
+        let ms = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+        let dlcs: Vec<_> = id.dlcs.iter().map(ToString::to_string).collect();
+        let changes = match id.dlc_changes {
+            0 => String::new(),
+            1 => " (1 change)".to_owned(),
+            changes => format!(" ({changes} changes)"),
+        };
+        let _ = writeln!(
+            out,
+            "  {:<8} {:>9} {:>10} {:>10} {:>10} {:>10} {:>6.2}%  {}{changes}",
+            id.id,
+            id.count,
+            ms(id.period_min_ms),
+            ms(id.period_mean_ms),
+            ms(id.period_max_ms),
+            ms(id.jitter_ms),
+            id.share_pct,
+            dlcs.join(",")
+        );
+    }
+}

@@ -161,7 +161,10 @@ impl Image {
     }
 
     fn bytes_at(&self, address: u32) -> Option<&[u8]> {
-        self.segments.iter().find_map(|(base, bytes)| bytes.get(address.checked_sub(*base)? as usize..))
+        self.segments.iter().find_map(|(base, bytes)| {
+            // The address just behind a segment is not in it, and may be the next one's first.
+            bytes.get(address.checked_sub(*base)? as usize..).filter(|bytes| !bytes.is_empty())
+        })
     }
 
     fn word_at(&self, address: u32) -> Option<u32> {

@@ -15,6 +15,8 @@ mod exit {
     /// Something failed; the message on stderr says what and what to do next.
     pub const FAILURE: u8 = 1;
     // 2 is a wrong command line; clap uses it by itself.
+    /// A check did not hold.
+    pub const CHECK_FAILED: u8 = 3;
 }
 
 /// Captures, understands and drives CAN buses with a cantap analyser.

@@ -2,13 +2,18 @@
 //! features, so that a program that only captures stays small.
 
 pub mod bits;
+#[cfg(feature = "signals")]
+pub mod condition;
 pub mod device;
+pub mod diff;
 pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
 pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;
+#[cfg(feature = "signals")]
+pub mod search;
 #[cfg(feature = "signals")]
 pub mod signals;
 #[cfg(feature = "virtual")]
@@ -19,6 +24,8 @@ pub mod stats;
 #[cfg(test)]
 mod testing;
 pub mod trace;
+#[cfg(feature = "signals")]
+pub mod trigger;
 #[cfg(feature = "virtual")]
 pub mod virtual_device;
 

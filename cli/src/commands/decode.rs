@@ -4,6 +4,8 @@ mod csv;
 mod json;
 mod text;
 
+pub use text::write_values;
+
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -103,7 +105,7 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
 }
 
 /// Seconds with six decimals, or nine where the trace has them.
-struct Seconds(i64);
+pub struct Seconds(pub i64);
 
 impl std::fmt::Display for Seconds {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {

@@ -2,6 +2,8 @@
 
 pub mod bits;
 pub mod decode;
+pub mod diff;
+pub mod search;
 pub mod stats;
 
 use std::process::ExitCode;
@@ -15,6 +17,10 @@ pub enum Command {
     Stats(stats::Args),
     /// Show a trace as signals, by DBC or signal file.
     Decode(decode::Args),
+    /// Show what two traces say differently: IDs, periods, lengths, bits.
+    Diff(diff::Args),
+    /// Find frames in a trace by ID, data or a condition on signals.
+    Search(search::Args),
 }
 
 impl Command {
@@ -24,6 +30,8 @@ impl Command {
             Self::Bits(args) => bits::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Decode(args) => decode::run(&args),
+            Self::Diff(args) => diff::run(&args),
+            Self::Search(args) => search::run(&args),
         }
     }
 }

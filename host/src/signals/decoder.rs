@@ -108,7 +108,7 @@ impl Decoder {
             };
             for message in database.messages {
                 lookup.insert(messages.len() as u32, message.id, message.j1939);
-                let plan = MessagePlan::new(&message, |_| true);
+                let plan = MessagePlan::new(&message, |_, _| true);
                 messages.push((channel, message, plan));
             }
         }
@@ -135,9 +135,17 @@ impl Decoder {
     pub fn select(&mut self, selection: &Selection) -> Result<(), SelectionError> {
         selection.check(&self.messages.iter().map(|(_, message, _)| message))?;
         for (_, message, plan) in &mut self.messages {
-            *plan = MessagePlan::new(message, |signal| selection.matches(message, signal));
+            *plan = MessagePlan::new(message, |_, signal| selection.matches(message, signal));
         }
         Ok(())
+    }
+
+    /// Decodes only those signals from now on that `keep` accepts, by message and index.
+    pub fn retain(&mut self, keep: impl Fn(MessageRef, usize, &Signal) -> bool) {
+        for (place, (_, message, plan)) in self.messages.iter_mut().enumerate() {
+            let reference = MessageRef(place as u32);
+            *plan = MessagePlan::new(message, |index, signal| keep(reference, index, signal));
+        }
     }
 
     /// All messages, with the channel their database is for.

@@ -328,16 +328,21 @@ impl Signal {
         }
     }
 
+    /// What the value table knows the raw bits by: the integer they are, before factor and offset.
+    pub fn table_key(&self, raw: u64) -> Option<i64> {
+        let value = self.integer(raw).or_else(|| {
+            let value = self.raw_to_f64(raw);
+            is_integer(value).then_some(value as i128)
+        });
+        i64::try_from(value?).ok()
+    }
+
     /// The text that the value table has for the raw bits.
     pub fn text(&self, raw: u64) -> Option<&str> {
         if self.values.is_empty() {
             return None;
         }
-        let value = self.integer(raw).or_else(|| {
-            let value = self.raw_to_f64(raw);
-            is_integer(value).then_some(value as i128)
-        });
-        self.values.text(i64::try_from(value?).ok()?)
+        self.values.text(self.table_key(raw)?)
     }
 }
 

@@ -117,10 +117,10 @@ impl Field {
 
 impl MessagePlan {
     /// Compiles those signals of `message` that `wanted` accepts.
-    pub fn new(message: &Message, wanted: impl Fn(&Signal) -> bool) -> Self {
+    pub fn new(message: &Message, wanted: impl Fn(usize, &Signal) -> bool) -> Self {
         let mut groups: Vec<Group> = Vec::new();
         for (index, signal) in message.signals.iter().enumerate() {
-            let (Some(field), true) = (Field::of(signal), wanted(signal)) else { continue };
+            let (Some(field), true) = (Field::of(signal), wanted(index, signal)) else { continue };
             let Some(conditions) = conditions(&message.signals, signal) else { continue };
             let unused = 64 - signal.length as u8;
             let conversion = match signal.kind {

@@ -2,6 +2,8 @@
 
 use std::io::{self, Write};
 
+use cantap::signals::{Message, SignalValue};
+
 use super::{Decoded, Seconds};
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
@@ -9,6 +11,12 @@ pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     // candump numbers interfaces from 0.
     let interface = record.channel.saturating_sub(1);
     write!(out, "({}) can{interface} {} {}:", Seconds(record.time_ns), frame.id(), message.name)?;
+    write_values(out, message, values)?;
+    writeln!(out)
+}
+
+/// ` Speed = 88 km/h, Gear = 3 (Drive)`.
+pub fn write_values(out: &mut impl Write, message: &Message, values: &[SignalValue]) -> io::Result<()> {
     for (at, value) in values.iter().enumerate() {
         let signal = &message.signals[value.signal as usize];
         let comma = if at == 0 { "" } else { "," };
@@ -20,5 +28,5 @@ pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
             write!(out, " ({text})")?;
         }
     }
-    writeln!(out)
+    Ok(())
 }

@@ -1,0 +1,136 @@
+//! `cantap diff`: what two traces say differently.
+
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use cantap::diff::{Changed, Difference, Key, Profile, compare};
+use serde_json::{Value, json};
+
+use crate::exit;
+use crate::input::ReadArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap diff before.log after.log\n  \
+    cantap diff good.blf bad.asc --tolerance 25 --json\n\n\
+    Bits are shown from the highest: 0 and 1 never changed in that trace, x did.\n\
+    Exit code: 0, also if the traces differ; with --check 3 if they do.")]
+pub struct Args {
+    /// The first trace.
+    a: PathBuf,
+    /// The second trace.
+    b: PathBuf,
+    /// Mean periods count as changed if they differ by more than so many percent.
+    #[arg(long, value_name = "PERCENT", default_value_t = 10.0, value_parser = percent)]
+    tolerance: f64,
+    /// Compare identifiers whatever channel they are on.
+    #[arg(long)]
+    ignore_channels: bool,
+    /// End with 3 if the traces differ.
+    #[arg(long)]
+    check: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+fn percent(text: &str) -> Result<f64, String> {
+    let value = text.trim_end_matches('%').parse::<f64>().ok();
+    value
+        .filter(|value| value.is_finite() && *value >= 0.0)
+        .ok_or_else(|| "write a percentage such as 10".to_owned())
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let (a, b) = (profile(args, &args.a)?, profile(args, &args.b)?);
+    let difference = compare(&a, &b, args.tolerance / 100.0);
+    let mut out = BufWriter::new(std::io::stdout().lock());
+    if args.json {
+        writeln!(out, "{}", to_json(&difference))?;
+    } else {
+        print(args, &difference, &mut out)?;
+    }
+    out.flush()?;
+    let failed = args.check && !difference.is_none();
+    Ok(if failed { ExitCode::from(exit::CHECK_FAILED) } else { ExitCode::SUCCESS })
+}
+
+fn profile(args: &Args, path: &Path) -> anyhow::Result<Profile> {
+    let mut profile = if args.ignore_channels { Profile::ignoring_channels() } else { Profile::default() };
+    let mut records = args.read.open(path)?;
+    while let Some(record) = records.next()? {
+        profile.add(&record);
+    }
+    Ok(profile)
+}
+
+fn name(key: Key) -> String {
+    // candump numbers interfaces from 0; no channel is channel 0.
+    let channel = key.channel.checked_sub(1).map(|interface| format!("can{interface} ")).unwrap_or_default();
+    format!("{channel}{}{}", key.id, if key.remote { " remote" } else { "" })
+}
+
+fn print(args: &Args, difference: &Difference, out: &mut impl Write) -> std::io::Result<()> {
+    for (path, only) in [(&args.a, &difference.only_a), (&args.b, &difference.only_b)] {
+        for (key, count) in only {
+            writeln!(out, "{}: only in {} ({count} frames)", name(*key), path.display())?;
+        }
+    }
+    for Changed { key, period_ns, dlcs, bytes } in &difference.changed {
+        let name = name(*key);
+        if let Some((a, b)) = period_ns {
+            writeln!(out, "{name}: period {:.3} ms -> {:.3} ms", a / 1e6, b / 1e6)?;
+        }
+        if let Some((a, b)) = dlcs {
+            writeln!(out, "{name}: DLC {} -> {}", list(a), list(b))?;
+        }
+        for byte in bytes {
+            let missing = |bits: &str| if bits.is_empty() { "none".to_owned() } else { bits.to_owned() };
+            writeln!(out, "{name}: byte {} {} -> {}", byte.byte, missing(&byte.a), missing(&byte.b))?;
+        }
+    }
+    let Difference { only_a, only_b, changed, same } = difference;
+    writeln!(
+        out,
+        "{} only in the first, {} only in the second, {} changed, {same} the same",
+        only_a.len(),
+        only_b.len(),
+        changed.len()
+    )
+}
+
+fn list(dlcs: &[u8]) -> String {
+    dlcs.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+}
+
+fn to_json(difference: &Difference) -> Value {
+    let kind = |key: Key| json!({ "ch": key.channel, "id": key.id.to_string(), "remote": key.remote });
+    let only = |only: &[(Key, u64)]| {
+        let entries = only.iter().map(|(key, count)| {
+            let mut entry = kind(*key);
+            entry["count"] = (*count).into();
+            entry
+        });
+        entries.collect::<Vec<_>>()
+    };
+    let changed = difference.changed.iter().map(|changed| {
+        let mut entry = kind(changed.key);
+        entry["period_ms"] = changed.period_ns.map_or(Value::Null, |(a, b)| json!([a / 1e6, b / 1e6]));
+        entry["dlc"] = changed.dlcs.as_ref().map_or(Value::Null, |(a, b)| json!([a, b]));
+        let bytes = changed.bytes.iter().map(|byte| json!({ "byte": byte.byte, "a": byte.a, "b": byte.b }));
+        entry["bytes"] = bytes.collect();
+        entry
+    });
+    json!({
+        "only_a": only(&difference.only_a),
+        "only_b": only(&difference.only_b),
+        "changed": changed.collect::<Vec<_>>(),
+        "same": difference.same,
+        "equal": difference.is_none(),
+    })
+}

@@ -1,0 +1,240 @@
+//! `cantap search`: finding frames in a trace.
+
+use std::collections::VecDeque;
+use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::anyhow;
+use cantap::condition::Condition;
+use cantap::formats::{TraceWriter, WriteOptions, create_writer};
+use cantap::search::{DataPattern, IdPattern, Search};
+use cantap::signals::{Decoder, SignalValue};
+use cantap::{TraceEvent, TraceRecord};
+
+use super::decode;
+use crate::databases::DatabaseArgs;
+use crate::exit;
+use crate::input::ReadArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
+    cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
+    cantap search trace.blf --data '* DE AD' -o found.asc\n  \
+    cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n\n\
+    A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id,\n\
+    dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > >=,\n\
+    not, and, or, parentheses.\n\n\
+    Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
+pub struct Args {
+    /// The trace; - for standard input.
+    #[arg(value_name = "FILE")]
+    input: PathBuf,
+    /// What must hold, such as "Speed > 80 and Gear == 3".
+    #[arg(value_name = "CONDITION", conflicts_with = "condition")]
+    positional: Option<String>,
+    /// The condition, as an option.
+    #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION")]
+    condition: Option<String>,
+    /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF. Repeat for any of several.
+    #[arg(short, long = "id", value_name = "ID")]
+    ids: Vec<IdPattern>,
+    /// These data bytes from the first on: "11 ?? 3?"; * for any number. Repeat for any of several.
+    #[arg(short, long, value_name = "BYTES")]
+    data: Vec<DataPattern>,
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// Show so many records after each one found.
+    #[arg(short = 'A', long, value_name = "N")]
+    after_context: Option<usize>,
+    /// Show so many records before each one found.
+    #[arg(short = 'B', long, value_name = "N")]
+    before_context: Option<usize>,
+    /// Show so many records before and after each one found.
+    #[arg(short = 'C', long, value_name = "N", default_value_t = 0)]
+    context: usize,
+    /// Stop after so many were found.
+    #[arg(short, long, value_name = "N")]
+    max_count: Option<u64>,
+    /// Print only how many were found.
+    #[arg(short, long, conflicts_with_all = ["output", "json"])]
+    count: bool,
+    /// Write what was found, with its context, as a trace.
+    #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
+    output: Option<PathBuf>,
+    /// One JSON object per record.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+/// More context than anybody looks at would only take memory.
+const MAX_CONTEXT: usize = 1_000_000;
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let decoder = args.databases.load(args.read.strict)?;
+    let text = args.condition.as_ref().or(args.positional.as_ref());
+    let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
+    let condition = condition.map_err(|error| anyhow!("condition: {error}"))?;
+    if condition.is_none() && args.ids.is_empty() && args.data.is_empty() {
+        anyhow::bail!("nothing to look for; give --id, --data or a condition (see cantap search --help)");
+    }
+    let search = Search { ids: args.ids.clone(), data: args.data.clone(), condition };
+    let mut sink = Sink::new(args, decoder)?;
+    let found = find(args, search, &mut sink)?;
+    sink.finish()?;
+    if args.count {
+        writeln!(std::io::stdout(), "{found}")?;
+    }
+    Ok(if found > 0 { ExitCode::SUCCESS } else { ExitCode::from(exit::FAILURE) })
+}
+
+/// Goes through the trace and hands on what was found with its context; returns how many were.
+fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
+    let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
+    let after = args.after_context.unwrap_or(args.context);
+    let mut records = args.read.open(&args.input)?;
+    let live = records.is_live();
+    let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
+    let (mut found, mut still_after) = (0, 0);
+    // Whether something lies between the last record shown and the next.
+    let mut gap = false;
+    while let Some(record) = records.next()? {
+        let is_last = args.max_count.is_some_and(|max| found >= max);
+        if !is_last && search.finds(&record) {
+            if gap && found > 0 && before + after > 0 {
+                sink.separate()?;
+            }
+            for record in earlier.drain(..) {
+                sink.show(&record, false)?;
+            }
+            sink.show(&record, true)?;
+            (found, still_after, gap) = (found + 1, after, false);
+        } else if still_after > 0 {
+            sink.show(&record, false)?;
+            still_after -= 1;
+        } else if is_last {
+            break;
+        } else {
+            earlier.push_back(record);
+            if earlier.len() > before {
+                earlier.pop_front();
+                gap = true;
+            }
+        }
+        if live {
+            sink.flush()?;
+        }
+    }
+    Ok(found)
+}
+
+/// Where what was found goes.
+struct Sink {
+    kind: Kind,
+    decoder: Decoder,
+    values: Vec<SignalValue>,
+}
+
+enum Kind {
+    Nowhere,
+    Text(BufWriter<std::io::Stdout>),
+    Json(BufWriter<std::io::Stdout>),
+    Trace(Box<dyn TraceWriter>),
+}
+
+impl Sink {
+    fn new(args: &Args, decoder: Decoder) -> anyhow::Result<Self> {
+        let stdout = || BufWriter::with_capacity(1 << 16, std::io::stdout());
+        let kind = match (&args.output, args.count, args.json) {
+            (Some(path), ..) => Kind::Trace(create_writer(path, &WriteOptions::default())?),
+            (_, true, _) => Kind::Nowhere,
+            (_, _, true) => Kind::Json(stdout()),
+            _ => Kind::Text(stdout()),
+        };
+        Ok(Self { kind, decoder, values: Vec::new() })
+    }
+
+    /// As grep separates groups of lines.
+    fn separate(&mut self) -> std::io::Result<()> {
+        match &mut self.kind {
+            Kind::Text(out) => writeln!(out, "--"),
+            _ => Ok(()),
+        }
+    }
+
+    fn show(&mut self, record: &TraceRecord, found: bool) -> std::io::Result<()> {
+        let message =
+            record.frame().and_then(|frame| self.decoder.decode(record.channel, frame, &mut self.values));
+        let message = message.map(|message| self.decoder.message(message));
+        let time = decode::Seconds(record.time_ns);
+        match &mut self.kind {
+            Kind::Nowhere => Ok(()),
+            Kind::Trace(writer) => writer.write(record),
+            Kind::Text(out) => {
+                write!(out, "({time}) can{} ", record.channel.saturating_sub(1))?;
+                match record.frame() {
+                    Some(frame) => write!(out, "{frame}")?,
+                    None => write!(out, "{}", describe(&record.event))?,
+                }
+                if let Some(message) = message {
+                    write!(out, "  {}:", message.name)?;
+                    decode::write_values(out, message, &self.values)?;
+                }
+                writeln!(out)
+            }
+            Kind::Json(out) => {
+                let mut object = serde_json::json!({
+                    "t": record.time_ns as f64 / 1e9, "ch": record.channel, "match": found,
+                });
+                match record.frame() {
+                    Some(frame) => {
+                        object["id"] = frame.id().to_string().into();
+                        object["frame"] = frame.to_string().into();
+                    }
+                    None => object["event"] = describe(&record.event).into(),
+                }
+                if let Some(message) = message {
+                    object["message"] = message.name.as_str().into();
+                }
+                writeln!(out, "{object}")
+            }
+        }
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        match &mut self.kind {
+            Kind::Nowhere => Ok(()),
+            Kind::Text(out) | Kind::Json(out) => out.flush(),
+            Kind::Trace(writer) => writer.flush(),
+        }
+    }
+
+    fn finish(mut self) -> std::io::Result<()> {
+        self.flush()?;
+        if let Kind::Trace(writer) = self.kind {
+            for (what, count) in writer.finish()?.iter() {
+                eprintln!("cantap: the file's format cannot carry {what}: {count} left out");
+            }
+        }
+        Ok(())
+    }
+}
+
+/// An event that is no frame, in words.
+fn describe(event: &TraceEvent) -> String {
+    match event {
+        TraceEvent::Frame { frame, .. } => frame.to_string(),
+        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {kind:?}"),
+        TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
+        TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
+        TraceEvent::State { state, .. } => format!("controller: {state:?}"),
+        TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
+        TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
+        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {reason:?}"),
+    }
+}

@@ -1,0 +1,22 @@
+//! Conditions on frames and signals: `Speed > 80 and Gear == Drive`, `id == 0x123 and byte[0] & 0x80`.
+//!
+//! | Part | Means |
+//! |---|---|
+//! | `Speed`, `Engine.Speed` | a signal's physical value, the last one received |
+//! | `Gear == Drive`, `Gear == "Not available"` | a text of the signal's value table |
+//! | `id`, `dlc`, `len`, `ch` | the frame's identifier, length code, data bytes, channel (from 1) |
+//! | `ext`, `rtr` | 1 for a 29-bit identifier, for a remote frame |
+//! | `byte[0]` | a data byte, counted from 0 |
+//! | `error`, `lost` | 1 for a bus error, for a place where frames are missing |
+//! | `12`, `0x1F`, `0b101`, `1.5e3` | numbers |
+//! | `+ - * / % & \|`, `== != < <= > >=`, `not and or`, `( )` | as usual; `&` and `\|` bind tighter than comparisons |
+//!
+//! What is not known makes a comparison neither true nor false: a signal before its first frame, a
+//! byte beyond the data. A condition about signals alone is looked at when one of them arrives.
+
+mod bind;
+mod error;
+mod syntax;
+
+pub use bind::Condition;
+pub use error::{ConditionError, ConditionFault};

@@ -90,7 +90,7 @@ impl Step {
                 with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
             }
             Step::Doc => {
-                cmd!(shell, "cargo doc --locked --workspace --no-deps --all-features")
+                cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
                     .env("RUSTDOCFLAGS", "-D warnings")
                     .run()?;
             }

@@ -258,7 +258,7 @@ impl ChannelStatistics {
         self.windows.running(now_ns)
     }
 
-    /// What each identifier did, in order of appearance. At most [`MOST_IDS`].
+    /// What each identifier did, in order of appearance. At most [`MOST_IDS`](super::MOST_IDS).
     pub fn ids(&self) -> impl Iterator<Item = &IdStatistics> {
         self.ids.iter()
     }
@@ -273,7 +273,7 @@ impl ChannelStatistics {
         self.ids.len()
     }
 
-    /// Frames of identifiers beyond [`MOST_IDS`].
+    /// Frames of identifiers beyond [`MOST_IDS`](super::MOST_IDS).
     pub fn unlisted_frames(&self) -> u64 {
         self.ids.unlisted_frames
     }

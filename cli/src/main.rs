@@ -5,6 +5,7 @@ mod commands;
 mod databases;
 mod input;
 mod interrupt;
+mod timing_args;
 
 use std::process::ExitCode;
 

@@ -1,6 +1,7 @@
 //! The cantap host library: devices, records, time, statistics; trace files and signals behind
 //! features, so that a program that only captures stays small.
 
+pub mod bit_timing;
 pub mod bits;
 #[cfg(feature = "signals")]
 pub mod condition;

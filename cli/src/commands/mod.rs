@@ -5,6 +5,7 @@ pub mod decode;
 pub mod diff;
 pub mod search;
 pub mod stats;
+pub mod timing;
 
 use std::process::ExitCode;
 
@@ -21,6 +22,8 @@ pub enum Command {
     Diff(diff::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
     Search(search::Args),
+    /// List every bit timing of a bit rate, what each is worth, and the one to choose.
+    Timing(timing::Args),
 }
 
 impl Command {
@@ -32,6 +35,7 @@ impl Command {
             Self::Decode(args) => decode::run(&args),
             Self::Diff(args) => diff::run(&args),
             Self::Search(args) => search::run(&args),
+            Self::Timing(args) => timing::run(&args),
         }
     }
 }

@@ -129,7 +129,7 @@ fn older_side(device: u16) -> &'static str {
     if device < PROTOCOL_VERSION { "device's firmware" } else { "cantap program on this computer" }
 }
 
-fn no_timing(bitrate_bps: u32, reason: &NoTiming) -> String {
+pub(crate) fn no_timing(bitrate_bps: u32, reason: &NoTiming) -> String {
     match *reason {
         NoTiming::OutOfRange => format!(
             "a bit rate of {bitrate_bps} bit/s is impossible; choose one from {MIN_BITRATE_BPS} to {MAX_BITRATE_BPS}"

@@ -29,6 +29,7 @@ use cantap_wire::{BitTiming, Channel, Command, Hello, PROTOCOL_VERSION, Refusal,
 pub use address::Address;
 pub use clock::{ClockMap, ClockReport, UtcClock};
 pub use error::DeviceError;
+pub(crate) use error::no_timing;
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
 pub use link::Link;
 pub use pipe::{PipeReader, PipeWriter, pipe};

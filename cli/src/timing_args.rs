@@ -1,0 +1,132 @@
+//! How a user gives a bit timing; the same options in every command that opens a channel.
+
+use anyhow::bail;
+use cantap::bit_timing::{self, TimingError, TimingRequest};
+use cantap::wire::BitTiming;
+
+use crate::args;
+
+/// A bit timing on the command line; for commands to flatten into theirs.
+#[derive(clap::Args, Clone)]
+pub struct TimingArgs {
+    /// Bit rate in bit/s: 500000, 500k, 1M.
+    #[arg(short, long, value_name = "RATE", value_parser = args::bitrate)]
+    pub bitrate: Option<u32>,
+    #[command(flatten)]
+    wishes: Wishes,
+    /// The whole timing, in quanta: prescaler, PROP+PS1, PS2, jump width.
+    #[arg(long, value_name = "BRP,SEG1,SEG2,SJW", value_parser = bit_timing::parse_segments,
+          conflicts_with_all = ["bitrate", "sample_point", "sjw", "btr"])]
+    segments: Option<BitTiming>,
+    /// The whole timing, as bxCAN's register CAN_BTR: 0x001C0008.
+    #[arg(long, value_name = "REGISTER", value_parser = register,
+          conflicts_with_all = ["bitrate", "sample_point", "sjw"])]
+    btr: Option<BitTiming>,
+}
+
+/// What one may wish of a timing beside its bit rate.
+#[derive(clap::Args, Clone)]
+pub struct Wishes {
+    /// Sample point in per cent of the bit, instead of the one that CiA recommends.
+    #[arg(long, value_name = "PCT", value_parser = percent)]
+    pub sample_point: Option<f64>,
+    /// Resynchronisation jump width in quanta, 1 to 4.
+    #[arg(long, value_name = "QUANTA", value_parser = clap::value_parser!(u8).range(1..=4))]
+    pub sjw: Option<u8>,
+    /// Sample each bit three times: refused, since bxCAN cannot.
+    #[arg(long)]
+    triple: bool,
+}
+
+impl Wishes {
+    /// Refuses what no timing has.
+    pub fn check(&self) -> Result<(), TimingError> {
+        if self.triple { Err(TimingError::TripleSampling) } else { Ok(()) }
+    }
+}
+
+impl TimingArgs {
+    /// What was asked for, if anything was.
+    #[allow(dead_code, reason = "the first commands that open a channel are on their way")]
+    pub fn request(&self) -> anyhow::Result<Option<TimingRequest>> {
+        self.wishes.check()?;
+        if let Some(timing) = self.segments.or(self.btr) {
+            return Ok(Some(TimingRequest::Exact(timing)));
+        }
+        let Wishes { sample_point, sjw, .. } = self.wishes;
+        match self.bitrate {
+            Some(bitrate_bps) => {
+                Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
+            }
+            None if sample_point.is_some() || sjw.is_some() => {
+                bail!("a sample point or jump width needs a bit rate; add -b RATE")
+            }
+            None => Ok(None),
+        }
+    }
+}
+
+/// A register in C's notation or plain hexadecimal.
+fn register(text: &str) -> Result<BitTiming, String> {
+    let digits = text.strip_prefix("0x").or_else(|| text.strip_prefix("0X")).unwrap_or(text);
+    let plain = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
+    let value = u32::from_str_radix(digits, 16).ok().filter(|_| plain);
+    let value = value.ok_or("write the register in hexadecimal, such as 0x001C0008")?;
+    bit_timing::from_register(value).map_err(|error| error.to_string())
+}
+
+fn percent(text: &str) -> Result<f64, String> {
+    let value = text.strip_suffix('%').unwrap_or(text).parse::<f64>();
+    value
+        .ok()
+        .filter(|value| (1.0..100.0).contains(value))
+        .ok_or_else(|| "write the sample point in per cent of the bit, such as 80 or 87.5".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        timing: TimingArgs,
+    }
+
+    fn timing(line: &str) -> Result<Option<BitTiming>, String> {
+        let line = Line::try_parse_from(std::iter::once("x").chain(line.split_whitespace()))
+            .map_err(|error| error.to_string())?;
+        let request = line.timing.request().map_err(|error| error.to_string())?;
+        request.map(|request| request.resolve(36_000_000)).transpose().map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn a_timing_is_given_by_rate_segments_or_register() {
+        let expected = BitTiming { prescaler: 9, segment1: 13, segment2: 2, jump_width: 2 };
+        for line in ["-b 250k", "--segments 9,13,2,2", "--btr 0x011C0008", "--btr 11c0008"] {
+            assert_eq!(timing(line), Ok(Some(expected)), "{line}");
+        }
+        let narrow = BitTiming { jump_width: 1, ..expected };
+        assert_eq!(timing("-b 250000 --sample-point 87.5 --sjw 1"), Ok(Some(narrow)));
+        assert_eq!(timing(""), Ok(None));
+    }
+
+    #[test]
+    fn contradictions_and_impossible_wishes_are_refused() {
+        for line in [
+            "-b 250k --segments 9,13,2,2",
+            "--btr 1 --segments 9,13,2,2",
+            "--sjw 1",
+            "--sample-point 80",
+            "-b 250k --sjw 5",
+            "-b 250k --sample-point 100",
+            "-b 250k --triple",
+            "--btr +1",
+            "--btr 0x80000000",
+            "-b 251000",
+        ] {
+            assert!(timing(line).is_err(), "{line}");
+        }
+    }
+}

@@ -6,7 +6,7 @@ use core::mem::MaybeUninit;
 use core::panic::PanicInfo;
 use core::ptr::{addr_of, addr_of_mut};
 
-use cortex_m::peripheral::SCB;
+use cortex_m::peripheral::{NVIC, SCB};
 use cortex_m_rt::{ExceptionFrame, exception};
 use stm32f4xx_hal::pac;
 
@@ -54,9 +54,10 @@ pub fn begin(rcc: &pac::RCC, syscfg: &pac::SYSCFG) -> bool {
         rcc.apb2enr().modify(|_, w| w.syscfgen().enabled());
         // SAFETY: the field has two bits, and this is one of its values.
         syscfg.memrmp().modify(|_, w| unsafe { w.mem_mode().bits(MAP_SYSTEM_MEMORY) });
-        // SAFETY: nothing but the clock gate above has been touched since reset, which is the state the bootloader
-        // expects; it needs interrupts, which startup has masked.
+        // SAFETY: with the tasks' interrupts off again, nothing but the clock gate above differs from the state after a
+        // reset, which is what the bootloader expects; it needs interrupts as such, which startup has masked.
         unsafe {
+            (*NVIC::PTR).icer.iter().for_each(|disable| disable.write(u32::MAX));
             cortex_m::interrupt::enable();
             cortex_m::asm::bootload(SYSTEM_MEMORY);
         }

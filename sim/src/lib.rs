@@ -7,6 +7,7 @@
 
 pub mod bus;
 pub mod can;
+pub mod capture;
 pub mod cpu;
 pub mod elf;
 pub mod machine;
@@ -14,6 +15,8 @@ pub mod memory_map;
 pub mod otg;
 pub mod peripheral;
 pub mod probe;
+#[cfg(unix)]
+pub mod pty;
 pub mod soc;
 pub mod stop;
 pub mod trace;

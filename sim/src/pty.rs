@@ -1,0 +1,104 @@
+//! A pseudo-terminal that stands for the device's serial port, so that any program which opens a
+//! serial port can use the emulated device.
+
+use std::io;
+use std::os::fd::OwnedFd;
+
+use rustix::fs::{Mode, OFlags};
+use rustix::io::Errno;
+use rustix::pty::OpenptFlags;
+use rustix::termios::OptionalActions;
+
+/// Bytes that one exchange moves at most.
+const PIECE: usize = 4096;
+
+/// The device's end of a pseudo-terminal.
+#[derive(Debug)]
+pub struct Pty {
+    master: OwnedFd,
+    /// Keeps the terminal alive between two clients: with no slave open at all, reads of the master
+    /// fail and its settings are lost.
+    _slave: OwnedFd,
+    name: String,
+}
+
+impl Pty {
+    /// Opens one, in raw mode before anybody can know its name: a cooked terminal would change bytes and
+    /// echo them.
+    pub fn open() -> io::Result<Self> {
+        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY;
+        let master = rustix::pty::openpt(flags)?;
+        rustix::pty::grantpt(&master)?;
+        rustix::pty::unlockpt(&master)?;
+        let path = rustix::pty::ptsname(&master, Vec::new())?;
+        let slave = rustix::fs::open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
+        let mut settings = rustix::termios::tcgetattr(&slave)?;
+        settings.make_raw();
+        rustix::termios::tcsetattr(&slave, OptionalActions::Now, &settings)?;
+        let status = rustix::fs::fcntl_getfl(&master)?;
+        rustix::fs::fcntl_setfl(&master, status | OFlags::NONBLOCK)?;
+        let name = path.into_string().map_err(|_| io::Error::other("the terminal's name is not text"))?;
+        Ok(Self { master, _slave: slave, name })
+    }
+
+    /// The name that clients open.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// Takes what clients wrote, without waiting.
+    pub fn read(&self) -> io::Result<Vec<u8>> {
+        let mut bytes = vec![0; PIECE];
+        let len = or_nothing(rustix::io::read(&self.master, &mut bytes[..]))?;
+        bytes.truncate(len);
+        Ok(bytes)
+    }
+
+    /// Writes as much as the terminal takes and returns how much that was.
+    pub fn write(&self, bytes: &[u8]) -> io::Result<usize> {
+        or_nothing(rustix::io::write(&self.master, &bytes[..bytes.len().min(PIECE)]))
+    }
+}
+
+/// A terminal that is not ready moved nothing.
+fn or_nothing(result: Result<usize, Errno>) -> io::Result<usize> {
+    match result {
+        Ok(len) => Ok(len),
+        Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+        Err(error) => Err(error.into()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::File;
+    use std::io::{Read, Write};
+
+    #[test]
+    fn bytes_pass_unchanged_and_a_second_client_finds_the_port_open() {
+        let pty = Pty::open().unwrap();
+        let all: Vec<u8> = (0..=255).collect();
+        for _ in 0..2 {
+            let mut client = File::options().read(true).write(true).open(pty.name()).unwrap();
+            assert_eq!(pty.write(&all).unwrap(), all.len());
+            let mut read = vec![0; all.len()];
+            client.read_exact(&mut read).unwrap();
+            assert_eq!(read, all);
+            client.write_all(&all).unwrap();
+            let mut got = Vec::new();
+            while got.len() < all.len() {
+                got.extend(pty.read().unwrap());
+            }
+            assert_eq!(got, all);
+        }
+        assert_eq!(pty.read().unwrap(), b"");
+    }
+
+    #[test]
+    fn a_terminal_that_nobody_reads_takes_no_more_at_some_point() {
+        let pty = Pty::open().unwrap();
+        let filled = (0..10_000).try_for_each(|_| if pty.write(&[0; PIECE]).unwrap() == 0 { Err(()) } else { Ok(()) });
+        assert_eq!(filled, Err(()));
+    }
+}

@@ -197,7 +197,10 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// Starts a session: counters at zero. Both channels are closed and the queue is empty.
-    pub fn restart(&mut self, clock: &impl Clock) {
+    ///
+    /// Returns the time that the first record's difference counts from, which the sender must have too: a
+    /// later reading would move every stamp of the session.
+    pub fn restart(&mut self, clock: &impl Clock) -> u64 {
         let now = self.now(clock);
         self.recorder.restart(now);
         for state in &mut self.channels {
@@ -207,6 +210,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.transmitter.clear();
             state.transmitter.reset_counters();
         }
+        now
     }
 
     /// The channel is about to join the bus.

@@ -133,10 +133,7 @@ impl<'q, const N: usize> Session<'q, N> {
         self.work = None;
         if matches!(work, Work::Silence) {
             self.queue.clear();
-            let now = board.with_capture(|capture, _, clock| {
-                capture.restart(clock);
-                capture.now(clock)
-            });
+            let now = board.with_capture(|capture, _, clock| capture.restart(clock));
             self.sender.restart(now);
             self.slcan.restart(now);
         }

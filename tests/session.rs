@@ -32,6 +32,23 @@ fn nothing_is_sent_before_the_host_speaks() {
     assert!(bench.port.packets.is_empty());
 }
 
+/// The start of a session takes time; were it read twice, every stamp of the session would be off by it.
+#[test]
+fn stamps_do_not_depend_on_how_long_the_start_of_the_session_takes() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.board.clock.step.set(1000);
+    bench.greet();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
+    bench.board.clock.step.set(0);
+    bench.records.clear();
+    let at = u64::from(bench.board.clock.now.get());
+    bench.receive(CAN1, numbered(1));
+    bench.millisecond();
+    bench.millisecond();
+    assert_eq!(bench.records.last().map(|(ticks, _)| *ticks), Some(at));
+}
+
 #[test]
 fn another_protocol_version_is_refused_and_changes_nothing() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

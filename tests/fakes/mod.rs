@@ -26,12 +26,14 @@ pub const SMALL_QUEUE: usize = 16 * 1024;
 #[derive(Default)]
 pub struct FakeClock {
     pub now: Cell<u32>,
+    /// How far time moves with each reading.
+    pub step: Cell<u32>,
     pub alarm: Cell<Option<u32>>,
 }
 
 impl Clock for FakeClock {
     fn now(&self) -> u32 {
-        self.now.get()
+        self.now.replace(self.now.get().wrapping_add(self.step.get()))
     }
 
     fn set_alarm(&self, at: Option<u32>) {

@@ -17,6 +17,7 @@ pub mod peripheral;
 pub mod probe;
 #[cfg(unix)]
 pub mod pty;
+pub mod rig;
 pub mod soc;
 pub mod stop;
 pub mod trace;

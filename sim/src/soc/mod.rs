@@ -151,6 +151,12 @@ impl Board {
         self.watchdog.deadline()
     }
 
+    /// The core cycle at which TIM2, the firmware's stamp timer, stood at zero, if it has counted without
+    /// being written or stopped since.
+    pub fn stamp_timer_origin(&mut self, now: u64) -> u64 {
+        self.timers[0].origin(now)
+    }
+
     /// Every access that was odd, with how often.
     pub fn odd_accesses(&self) -> Vec<OddAccess> {
         let access = |(key, count): (&(Oddity, u32, bool), &u64)| OddAccess {

@@ -130,6 +130,12 @@ impl Timer {
         Some(())
     }
 
+    /// The core cycle at which the count was zero, were it to have run at its present rate all the time.
+    pub fn origin(&mut self, now: u64) -> u64 {
+        self.advance(now);
+        self.since.saturating_sub(u64::from(self.count) * self.tick())
+    }
+
     /// Whether an enabled flag stands.
     pub fn irq(&self) -> bool {
         self.flags & self.interrupts & 0x1F != 0

@@ -1,0 +1,364 @@
+//! A bench with everything on it: the board with its firmware, two CAN buses, a USB host, the capture
+//! host and the books. Runs are sequences of calls here; time is emulated and stands still between them.
+
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cantap_wire::message::{ChannelConfig, Hello, Status};
+use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Record, Refusal, Reply, Response};
+
+use crate::bus::{BitTime, Node, Source};
+use crate::capture::{Heard, Ledger, Session};
+use crate::elf::Image;
+use crate::machine::{Machine, Setup};
+use crate::memory_map as map;
+use crate::otg::Otg;
+use crate::stop::Stopped;
+use crate::usb::UsbPort;
+use crate::usb_host::{self, EnumerationError, Timing, UsbHost};
+use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+
+/// Core cycles of a millisecond.
+pub const MS: u64 = 1000 * CYCLES_PER_US;
+/// How long a device may take from plugging in to a configured port.
+const ENUMERATION_TIMEOUT: u64 = 3 * CYCLES_PER_SECOND;
+/// How long a request may take.
+const REQUEST_TIMEOUT: u64 = CYCLES_PER_SECOND;
+/// A stream that is silent for so long has nothing more to say.
+const SILENCE: u64 = 20 * MS;
+
+/// What went wrong on the bench, apart from wrong frames, which are the ledger's.
+#[derive(Debug, thiserror::Error)]
+pub enum RigError {
+    /// The firmware ended.
+    #[error("{0}")]
+    Stopped(#[from] Stopped),
+    /// The device did not enumerate.
+    #[error("the device did not enumerate: {0}")]
+    Enumeration(EnumerationError),
+    /// It did not come up at all.
+    #[error("no configured device {0} ms after plugging in")]
+    NoDevice(u64),
+    /// A request was not answered.
+    #[error("no answer to {command} within {millis} ms; the last bytes came {silent_ms} ms ago")]
+    NoAnswer {
+        /// The request.
+        command: String,
+        /// How long was waited.
+        millis: u64,
+        /// How long the device had been silent.
+        silent_ms: u64,
+    },
+    /// A request was refused that must not be.
+    #[error("{command} was refused: {refusal:?}")]
+    Refused {
+        /// The request.
+        command: String,
+        /// The reason.
+        refusal: Refusal,
+    },
+    /// A request was answered with a value that does not answer it.
+    #[error("{command} was answered with {reply}")]
+    WrongReply {
+        /// The request.
+        command: String,
+        /// The value.
+        reply: String,
+    },
+    /// There is no bit timing for a bit rate.
+    #[error("{bitrate_bps} bit/s cannot be made from the controllers' clock")]
+    BitRate {
+        /// The rate.
+        bitrate_bps: u32,
+    },
+}
+
+/// The bench.
+pub struct Rig {
+    /// The board.
+    pub machine: Machine,
+    /// What the device said.
+    pub session: Session,
+    /// Whether it told the truth.
+    pub ledger: Ledger,
+    usb: Arc<Mutex<UsbPort>>,
+    /// Channels whose frames are in the books.
+    booked: [bool; CHANNELS],
+    events: Vec<(u64, Event)>,
+    last_bytes_at: u64,
+    /// Bits of frames on each bus, with intermission, as long as it was booked.
+    bus_bits: [u64; CHANNELS],
+    recording: Option<Vec<u8>>,
+}
+
+impl Rig {
+    /// A board with `image` and the cable out.
+    pub fn new(image: Image, setup: Setup, timing: Timing) -> Self {
+        let mut machine = Machine::new(image, setup);
+        let usb = Arc::new(Mutex::new(UsbPort::new(timing)));
+        machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::clone(&usb) as _);
+        Self {
+            machine,
+            session: Session::new(),
+            ledger: Ledger::new(),
+            usb,
+            booked: [false; CHANNELS],
+            events: Vec::new(),
+            last_bytes_at: 0,
+            bus_bits: [0; CHANNELS],
+            recording: None,
+        }
+    }
+
+    /// Core cycles since power-on.
+    pub fn now(&self) -> u64 {
+        self.machine.now()
+    }
+
+    /// Does something with the USB host, at the present time.
+    pub fn with_host<R>(&mut self, action: impl FnOnce(&mut UsbHost, &mut Otg) -> R) -> R {
+        let now = self.machine.now();
+        // A thread that panicked while it held the lock left a port that is as good as any other.
+        let mut usb = self.usb.lock().unwrap_or_else(PoisonError::into_inner);
+        let (host, otg) = usb.host(now);
+        action(host, otg)
+    }
+
+    /// Runs for `cycles`, and takes in what the buses carried and the device said.
+    pub fn run_for(&mut self, cycles: u64) -> Result<(), RigError> {
+        let until = self.now() + cycles;
+        while self.now() < until {
+            let slice = until.min(self.now() + MS);
+            self.machine.run_until(slice)?;
+            self.exchange();
+        }
+        Ok(())
+    }
+
+    /// Runs until `done` says so, asking once a millisecond; whether it did before `limit` cycles were over.
+    pub fn run_while(
+        &mut self,
+        limit: u64,
+        mut goes_on: impl FnMut(&mut Self) -> bool,
+    ) -> Result<bool, RigError> {
+        let until = self.now() + limit;
+        while goes_on(self) {
+            if self.now() >= until {
+                return Ok(false);
+            }
+            self.run_for(MS)?;
+        }
+        Ok(true)
+    }
+
+    /// Moves the buses' histories into the books and the host's bytes into the session.
+    fn exchange(&mut self) {
+        let mut board = self.machine.board();
+        for wire in &mut board.wires {
+            for crossed in wire.take_history() {
+                let bits = u64::from(crate::bus::bits::bus_bits(&crossed.frame));
+                for channel in Channel::ALL {
+                    let n = channel.index();
+                    if self.booked[n] && crossed.taken_by >> n & 1 != 0 {
+                        self.ledger.on_bus(channel, crossed.frame, crossed.valid);
+                        self.bus_bits[n] += bits;
+                    }
+                }
+            }
+        }
+        drop(board);
+        let bytes = self.with_host(|host, _| host.receive());
+        if bytes.is_empty() {
+            return;
+        }
+        self.last_bytes_at = self.now();
+        if let Some(recording) = &mut self.recording {
+            recording.extend_from_slice(&bytes);
+        }
+        let Self { session, ledger, events, .. } = self;
+        session.take(&bytes, |heard| {
+            if let Heard::Record(ticks, Record::Event(event)) = &heard {
+                events.push((*ticks, *event));
+            }
+            ledger.heard(&heard);
+        });
+    }
+
+    /// Puts the cable in, waits for the enumeration and opens the port.
+    pub fn plug_in(&mut self) -> Result<(), RigError> {
+        self.with_host(|host, _| host.plug());
+        self.wait_for_port()
+    }
+
+    /// Waits until the device is configured, opens the port and waits until the device knows it.
+    pub fn wait_for_port(&mut self) -> Result<(), RigError> {
+        let mut failure = None;
+        let up = self.run_while(ENUMERATION_TIMEOUT, |rig| {
+            rig.with_host(|host, _| match host.status() {
+                usb_host::Status::Ready => {
+                    host.open_port();
+                    !host.port_ready()
+                }
+                usb_host::Status::Failed(error) => {
+                    failure = Some(error);
+                    false
+                }
+                _ => true,
+            })
+        })?;
+        match failure {
+            Some(error) => Err(RigError::Enumeration(error)),
+            None if up => Ok(()),
+            None => Err(RigError::NoDevice(ENUMERATION_TIMEOUT / MS)),
+        }
+    }
+
+    /// Begins a session.
+    pub fn greet(&mut self) -> Result<Hello, RigError> {
+        self.session.restart();
+        let reply = self.ask(Command::Hello { protocol: cantap_wire::PROTOCOL_VERSION })?;
+        let Reply::Hello(hello) = reply else {
+            return Err(wrong("Hello", &reply));
+        };
+        self.follow_clock(hello.tick_hz);
+        Ok(hello)
+    }
+
+    /// Plugs in, opens the port and begins a session.
+    pub fn connect(&mut self) -> Result<Hello, RigError> {
+        self.plug_in()?;
+        self.greet()
+    }
+
+    /// Tells the ledger how the device's clock stands, taken from the stamp timer itself.
+    fn follow_clock(&mut self, tick_hz: u32) {
+        let now = self.now();
+        let origin = self.machine.board().stamp_timer_origin(now);
+        self.ledger.set_clock(origin, CYCLES_PER_SECOND / u64::from(tick_hz));
+    }
+
+    /// Sends a request and waits for its answer.
+    pub fn request(&mut self, command: Command) -> Result<Response, RigError> {
+        let name = name_of(&command);
+        let (id, bytes) = self.session.request(command);
+        self.with_host(|host, _| host.send(&bytes));
+        let mut response = None;
+        self.run_while(REQUEST_TIMEOUT, |rig| {
+            response = rig.session.response(id);
+            response.is_none()
+        })?;
+        response.ok_or_else(|| RigError::NoAnswer {
+            command: name,
+            millis: REQUEST_TIMEOUT / MS,
+            silent_ms: (self.now() - self.last_bytes_at) / MS,
+        })
+    }
+
+    /// Sends a request that must not be refused.
+    pub fn ask(&mut self, command: Command) -> Result<Reply, RigError> {
+        let name = name_of(&command);
+        let response = self.request(command)?;
+        response.result.map_err(|refusal| RigError::Refused { command: name, refusal })
+    }
+
+    /// Opens a channel with a configuration and begins its books.
+    pub fn open(&mut self, channel: Channel, config: ChannelConfig) -> Result<(), RigError> {
+        self.booked[channel.index()] = true;
+        self.ask(Command::Open { channel, config: Some(config) })?;
+        Ok(())
+    }
+
+    /// Opens a channel that only listens.
+    pub fn listen(&mut self, channel: Channel, bitrate_bps: u32) -> Result<(), RigError> {
+        self.open(channel, ChannelConfig::listen_only(timing(bitrate_bps)?))
+    }
+
+    /// Waits until the device has nothing more to say, for `limit` cycles at most.
+    pub fn drain(&mut self, limit: u64) -> Result<bool, RigError> {
+        let from = self.now();
+        self.run_while(limit, |rig| rig.now() - from.max(rig.last_bytes_at) < SILENCE)
+    }
+
+    /// Closes a channel, waits until it has delivered everything, and closes its books.
+    pub fn close(&mut self, channel: Channel) -> Result<(), RigError> {
+        let stopped = |event: &(u64, Event)| event.1 == Event::Stopped { channel };
+        let before = self.events.iter().filter(|event| stopped(event)).count();
+        self.ask(Command::Close { channel })?;
+        let limit = 3 * CYCLES_PER_SECOND;
+        let whole = self.run_while(limit, |rig| rig.events.iter().filter(|event| stopped(event)).count() == before)?;
+        self.booked[channel.index()] = false;
+        self.ledger.close(channel, whole);
+        Ok(())
+    }
+
+    /// The session was cut (unplugged, reset, suspended): what has not arrived will not.
+    pub fn cut(&mut self) {
+        self.exchange();
+        for channel in Channel::ALL {
+            self.booked[channel.index()] = false;
+            self.ledger.close(channel, false);
+        }
+    }
+
+    /// The device's status.
+    pub fn status(&mut self) -> Result<Status, RigError> {
+        match self.ask(Command::Status)? {
+            Reply::Status(status) => Ok(status),
+            reply => Err(wrong("Status", &reply)),
+        }
+    }
+
+    /// Puts a sender on a channel's bus, and a second node that acknowledges.
+    pub fn add_traffic(&mut self, channel: Channel, bitrate_bps: u32, source: impl Source + 'static) {
+        let bit = BitTime::of_rate(bitrate_bps);
+        let wire = &mut self.machine.board().wires[channel.index()];
+        wire.add(Node::new(bit).with_source(source));
+        wire.add(Node::new(bit));
+    }
+
+    /// Whether a channel's controller takes part in its bus, if only as a listener.
+    pub fn takes_part(&self, channel: Channel) -> bool {
+        self.machine.board().can.controllers[channel.index()].listens()
+    }
+
+    /// Bits that a channel's controller has driven dominant since power-on.
+    pub fn dominant_bits(&self, channel: Channel) -> u64 {
+        self.machine.board().can.controllers[channel.index()].dominant_bits()
+    }
+
+    /// Bits of the frames in a channel's books, with intermission.
+    pub fn bus_bits(&self, channel: Channel) -> u64 {
+        self.bus_bits[channel.index()]
+    }
+
+    /// Events that the device reported, with their device times.
+    pub fn events(&self) -> &[(u64, Event)] {
+        &self.events
+    }
+
+    /// Keeps the bytes that the device sends from now on.
+    pub fn record_bytes(&mut self) {
+        self.recording = Some(Vec::new());
+    }
+
+    /// The bytes kept so far.
+    pub fn recorded_bytes(&self) -> &[u8] {
+        self.recording.as_deref().unwrap_or_default()
+    }
+}
+
+/// The bit timing for a bit rate, from the clock that the product's boards have.
+pub fn timing(bitrate_bps: u32) -> Result<BitTiming, RigError> {
+    /// APB1 at 36 MHz.
+    const CAN_CLOCK_HZ: u32 = (CYCLES_PER_SECOND / 4) as u32;
+    BitTiming::choose(CAN_CLOCK_HZ, bitrate_bps, None).map_err(|_| RigError::BitRate { bitrate_bps })
+}
+
+/// The command's name for messages.
+fn name_of(command: &Command) -> String {
+    let debug = format!("{command:?}");
+    debug.split([' ', '{', '(']).next().unwrap_or_default().to_owned()
+}
+
+fn wrong(command: &str, reply: &Reply) -> RigError {
+    RigError::WrongReply { command: command.to_owned(), reply: format!("{reply:?}") }
+}

@@ -1,0 +1,17 @@
+//! The firmware on USB: enumeration, and the conversation with its host.
+
+mod common;
+
+use cantap_sim::machine::Setup;
+use cantap_sim::rig::Rig;
+use cantap_sim::usb_host::Timing;
+
+#[test]
+fn the_device_enumerates_as_a_serial_port_and_says_hello() {
+    let Some(image) = common::firmware() else { return };
+    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    let hello = rig.connect().unwrap();
+    println!("{hello:?} at {} us", rig.now() / 144);
+    let identity = rig.with_host(|host, _| host.identity().cloned()).unwrap();
+    println!("{identity:?}");
+}

@@ -98,7 +98,8 @@ mod tests {
     #[test]
     fn a_terminal_that_nobody_reads_takes_no_more_at_some_point() {
         let pty = Pty::open().unwrap();
-        let filled = (0..10_000).try_for_each(|_| if pty.write(&[0; PIECE]).unwrap() == 0 { Err(()) } else { Ok(()) });
+        let filled =
+            (0..10_000).try_for_each(|_| if pty.write(&[0; PIECE]).unwrap() == 0 { Err(()) } else { Ok(()) });
         assert_eq!(filled, Err(()));
     }
 }

@@ -284,7 +284,8 @@ impl Rig {
         let before = self.events.iter().filter(|event| stopped(event)).count();
         self.ask(Command::Close { channel })?;
         let limit = 3 * CYCLES_PER_SECOND;
-        let whole = self.run_while(limit, |rig| rig.events.iter().filter(|event| stopped(event)).count() == before)?;
+        let whole =
+            self.run_while(limit, |rig| rig.events.iter().filter(|event| stopped(event)).count() == before)?;
         self.booked[channel.index()] = false;
         self.ledger.close(channel, whole);
         Ok(())

@@ -113,7 +113,9 @@ impl Ledger {
                     LossStage::Controller => books.announced.controller += count,
                     LossStage::Queue => books.announced.queue += count,
                     LossStage::Link | LossStage::Host => {
-                        self.fault(format!("the device reports a loss of stage {stage:?}, which only a host can"));
+                        self.fault(format!(
+                            "the device reports a loss of stage {stage:?}, which only a host can"
+                        ));
                         return;
                     }
                 }
@@ -157,7 +159,9 @@ impl Ledger {
             Some((_, truth)) => {
                 let (number, count) = (channel.number(), self.books[channel.index()].delivered);
                 let (got, sent) = (received.frame, truth.frame);
-                self.fault(format!("channel {number}: delivered frame {count} is {got}, on the bus it was {sent}"));
+                self.fault(format!(
+                    "channel {number}: delivered frame {count} is {got}, on the bus it was {sent}"
+                ));
                 self.resynchronise(channel, received);
             }
             None => {
@@ -336,7 +340,8 @@ mod tests {
     }
 
     fn deliver(ledger: &mut Ledger, n: u64) {
-        let received = Received { channel: CHANNEL, frame: frame(n), stamp: Stamp::Exact, data_omitted: false };
+        let received =
+            Received { channel: CHANNEL, frame: frame(n), stamp: Stamp::Exact, data_omitted: false };
         ledger.heard(&Heard::Record(n * GAP / 12 + 6, Record::Received(received)));
     }
 

@@ -25,13 +25,7 @@ pub struct Session {
 impl Session {
     /// Before the first request.
     pub fn new() -> Self {
-        Self {
-            decoder: Decoder::new(),
-            next_id: 1,
-            responses: Vec::new(),
-            corruptions: Vec::new(),
-            bytes: 0,
-        }
+        Self { decoder: Decoder::new(), next_id: 1, responses: Vec::new(), corruptions: Vec::new(), bytes: 0 }
     }
 
     /// The bytes of a request, and its id. A zero goes in front: it ends what somebody else may have

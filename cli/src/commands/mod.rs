@@ -4,6 +4,7 @@ pub mod bits;
 pub mod decode;
 pub mod diff;
 pub mod search;
+pub mod plot;
 pub mod stats;
 pub mod timing;
 
@@ -14,6 +15,8 @@ use std::process::ExitCode;
 pub enum Command {
     /// Show a frame's exact length on the bus, stuff bits and CRC.
     Bits(bits::Args),
+    /// Draw signals, bus load or periods of a trace: SVG, PNG, HTML, or in the terminal.
+    Plot(plot::Args),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
     Stats(stats::Args),
     /// Show a trace as signals, by DBC or signal file.
@@ -31,6 +34,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Bits(args) => bits::run(&args),
+            Self::Plot(args) => plot::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Decode(args) => decode::run(&args),
             Self::Diff(args) => diff::run(&args),

@@ -81,16 +81,22 @@ impl FromStr for ChannelBitrate {
     }
 }
 
-impl Args {
-    fn options(&self) -> Options {
-        let own = self.bitrates.iter().filter_map(|rate| Some((rate.channel?, rate.bitrate_bps)));
-        let common = self.bitrates.iter().rev().find(|rate| rate.channel.is_none());
+impl ChannelBitrate {
+    /// The library's options with these bit rates.
+    pub fn options(rates: &[Self]) -> Options {
+        let own = rates.iter().filter_map(|rate| Some((rate.channel?, rate.bitrate_bps)));
+        let common = rates.iter().rev().find(|rate| rate.channel.is_none());
         Options {
             bitrate_bps: common.map(|rate| rate.bitrate_bps),
             channel_bitrate_bps: own.collect(),
-            window: self.window,
             ..Options::default()
         }
+    }
+}
+
+impl Args {
+    fn options(&self) -> Options {
+        Options { window: self.window, ..ChannelBitrate::options(&self.bitrates) }
     }
 }
 

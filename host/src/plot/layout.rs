@@ -24,9 +24,6 @@ const LOSS: Colour = Colour([0x88, 0x88, 0x88], 90);
 const ABOVE: Colour = Colour([0xD0, 0x20, 0x20], 34);
 const BELOW: Colour = Colour([0x20, 0x50, 0xD0], 34);
 
-/// Curves with at most this many points show each as a dot.
-const MOST_DOTS: usize = 60;
-
 /// The plot as shapes, `width` units wide.
 pub(super) fn lay_out(plot: &Plot, width: u32) -> Scene {
     let mut scene =
@@ -255,12 +252,6 @@ fn draw_curve(curve: &Curve, number: usize, places: &Places, scene: &mut Scene) 
             scene.shapes.push(Shape::Dot { x, y, radius: 2.5, colour, curve: Some(number) });
         } else {
             line(scene, places_of_points, colour, 1.6, false, Some(number));
-        }
-    }
-    if points.len() <= MOST_DOTS && !curve.stepped {
-        for point in points.iter().filter(|point| !point.y.is_nan()) {
-            let (x, y) = (places.x(point.x), places.y(point.y));
-            scene.shapes.push(Shape::Dot { x, y, radius: 2.5, colour, curve: Some(number) });
         }
     }
 }

@@ -5,6 +5,7 @@
 //! they show the same. The terminal has its own drawing, made of characters. The font is part of the
 //! program: nothing is looked up on the machine.
 
+mod collect;
 mod histogram;
 mod html;
 mod layout;
@@ -17,6 +18,7 @@ mod text;
 
 use std::path::Path;
 
+pub use collect::{LoadCollector, MOST_CURVES, SignalCollector, TimingCollector};
 pub use histogram::{Bar, Histogram};
 pub use series::{MOST_POINTS, Point, Series};
 pub use text::TextStyle;

@@ -3,8 +3,8 @@
 pub mod bits;
 pub mod decode;
 pub mod diff;
-pub mod search;
 pub mod plot;
+pub mod search;
 pub mod stats;
 pub mod timing;
 

@@ -5,6 +5,7 @@ use std::path::Path;
 use std::str::FromStr;
 
 use super::blf;
+use super::trc::TrcVersion;
 
 /// A trace file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -15,6 +16,8 @@ pub enum Format {
     Asc,
     /// Vector's binary format.
     Blf,
+    /// PEAK's trace. Reading takes the version from the file.
+    Trc(TrcVersion),
 }
 
 /// Names, suffixes and a description of each format. The first name is the one shown; the first
@@ -23,6 +26,12 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Candump, &["candump", "log"], &["log", "txt"]),
     (Format::Asc, &["asc"], &["asc"]),
     (Format::Blf, &["blf"], &["blf"]),
+    (Format::Trc(TrcVersion::V2_1), &["trc", "trc2.1"], &["trc"]),
+    (Format::Trc(TrcVersion::V2_0), &["trc2.0"], &[]),
+    (Format::Trc(TrcVersion::V1_3), &["trc1.3"], &[]),
+    (Format::Trc(TrcVersion::V1_2), &["trc1.2"], &[]),
+    (Format::Trc(TrcVersion::V1_1), &["trc1.1"], &[]),
+    (Format::Trc(TrcVersion::V1_0), &["trc1.0"], &[]),
 ];
 
 /// No such format.
@@ -69,6 +78,8 @@ impl Format {
             Some(Self::Candump)
         } else if text.starts_with(b"date ") {
             Some(Self::Asc)
+        } else if text.starts_with(b";$FILEVERSION") || text.starts_with(b";####") {
+            Some(Self::Trc(TrcVersion::V2_1))
         } else {
             None
         }

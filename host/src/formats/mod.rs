@@ -24,6 +24,7 @@ mod sja1000;
 mod tests;
 #[allow(dead_code, reason = "the formats that follow use the rest")]
 mod text;
+mod trc;
 #[allow(dead_code, reason = "the formats that follow use the rest")]
 mod writer;
 
@@ -31,4 +32,5 @@ pub use format::{Format, UnknownFormat};
 pub use issue::{Fault, Place, ReadIssue};
 pub use reader::{OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotate::{BadRotation, RotateAt, Rotation};
+pub use trc::TrcVersion;
 pub use writer::{LeftOut, TraceWriter, WriteOptions, create_writer};

@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
-use super::{Format, UnknownFormat, asc, blf, candump};
+use super::{Format, UnknownFormat, asc, blf, candump, trc};
 use crate::TraceRecord;
 
 /// How to read.
@@ -89,6 +89,7 @@ impl TraceReader {
             Format::Candump => Box::new(candump::Decoder::default()),
             Format::Asc => Box::new(asc::Decoder::default()),
             Format::Blf => Box::new(blf::Decoder::default()),
+            Format::Trc(_) => Box::new(trc::Decoder::default()),
         };
         Self { name, format, input, decoder, strict, issues: 0, ended: false }
     }

@@ -6,7 +6,7 @@ use std::path::Path;
 
 use super::output::{Output, Patch};
 use super::rotate::{Rotating, Rotation};
-use super::{Format, asc, blf, candump};
+use super::{Format, asc, blf, candump, trc};
 use crate::TraceRecord;
 
 /// Bytes collected before they go to the system.
@@ -138,6 +138,7 @@ impl FileWriter {
             Format::Candump => Box::new(candump::Encoder),
             Format::Asc => Box::new(asc::Encoder::default()),
             Format::Blf => Box::new(blf::Encoder::default()),
+            Format::Trc(version) => Box::new(trc::Encoder::new(version)),
         };
         let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
         Self {

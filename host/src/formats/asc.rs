@@ -116,7 +116,7 @@ mod tests {
                 "test, line 10: expected a line that begins with a time in seconds, found 'rubbish'",
                 "test, line 11: expected 'd' or 'r' behind the direction, found nothing",
                 "test, line 12: expected 1 data bytes, found '1G'",
-                "test, line 14: expected 8 data bytes, found '01 02'",
+                "test, line 14: the file ends inside a line; everything before it was read",
             ]
         );
     }

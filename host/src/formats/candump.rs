@@ -8,7 +8,7 @@ use cantap_wire::{Frame, Id};
 
 use super::input::Input;
 use super::interfaces::{self, Interfaces};
-use super::issue::{Fault, Place};
+use super::issue::Fault;
 use super::reader::{Decode, Found};
 use super::text::{self, NS_PER_S};
 use super::writer::{Encode, LeftOut};
@@ -40,7 +40,7 @@ impl Decode for Decoder {
                     self.pending = second.map(|event| TraceRecord { event, ..record });
                     Found::Record(record)
                 }
-                Err(fault) => Found::Issue(Place::Line(line.number), fault),
+                Err(fault) => line.issue(fault),
             });
         }
         Ok(Found::End)

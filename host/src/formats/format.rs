@@ -4,8 +4,9 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
-use super::blf;
+use super::csv::CsvDialect;
 use super::trc::TrcVersion;
+use super::{blf, pcapng};
 
 /// A trace file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -18,6 +19,12 @@ pub enum Format {
     Blf,
     /// PEAK's trace. Reading takes the version from the file.
     Trc(TrcVersion),
+    /// Comma-separated values. Reading takes the dialect from the file.
+    Csv(CsvDialect),
+    /// Wireshark's format, with SocketCAN packets.
+    Pcapng,
+    /// The earlier CANanalyser's table in the format of old spreadsheets.
+    Dif,
 }
 
 /// Names, suffixes and a description of each format. The first name is the one shown; the first
@@ -32,6 +39,11 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Trc(TrcVersion::V1_2), &["trc1.2"], &[]),
     (Format::Trc(TrcVersion::V1_1), &["trc1.1"], &[]),
     (Format::Trc(TrcVersion::V1_0), &["trc1.0"], &[]),
+    (Format::Csv(CsvDialect::PythonCan), &["csv", "csv-python-can"], &["csv"]),
+    (Format::Csv(CsvDialect::Full), &["csv-full"], &[]),
+    (Format::Csv(CsvDialect::Analyser), &["csv-analyser"], &[]),
+    (Format::Pcapng, &["pcapng"], &["pcapng", "ntar"]),
+    (Format::Dif, &["dif"], &["dif"]),
 ];
 
 /// No such format.
@@ -74,6 +86,13 @@ impl Format {
         let text = head.trim_ascii_start();
         if head.starts_with(blf::FILE_MAGIC) {
             Some(Self::Blf)
+        } else if head.starts_with(&pcapng::SECTION_HEADER.to_le_bytes()) {
+            Some(Self::Pcapng)
+        } else if text.starts_with(b"timestamp,") || text.starts_with(b"time,") || text.starts_with(b"Index")
+        {
+            Some(Self::Csv(CsvDialect::PythonCan))
+        } else if text.starts_with(b"TABLE") {
+            Some(Self::Dif)
         } else if text.starts_with(b"(") {
             Some(Self::Candump)
         } else if text.starts_with(b"date ") {

@@ -6,6 +6,9 @@ use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
+use super::issue::{Fault, Place};
+use super::reader::Found;
+
 /// Bytes asked of the system at a time.
 const CHUNK_BYTES: usize = 256 * 1024;
 
@@ -44,6 +47,17 @@ pub(crate) struct Line<'a> {
     pub terminated: bool,
     /// Whether the text is only the beginning of a line too long to hold.
     pub too_long: bool,
+}
+
+impl Line<'_> {
+    /// What is wrong with this line. The last line of a file that was cut off is no broken one.
+    pub(crate) fn issue(&self, fault: Fault) -> Found {
+        let fault = match fault {
+            Fault::Malformed { .. } if !self.terminated && !self.too_long => Fault::Truncated("a line"),
+            fault => fault,
+        };
+        Found::Issue(Place::Line(self.number), fault)
+    }
 }
 
 impl Input {

@@ -6,28 +6,31 @@
 //! or output. Each format is a file here, split into a decoder that takes bytes from an
 //! `Input` and an encoder that appends to a buffer; neither knows files, compression or rotation.
 
+mod analyser;
 mod asc;
 mod blf;
 mod calendar;
 mod candump;
+mod csv;
+mod dif;
 mod event_text;
 mod format;
-#[allow(dead_code, reason = "the formats that follow use the rest")]
 mod input;
 mod interfaces;
 mod issue;
 mod output;
+mod pcapng;
 mod reader;
 mod rotate;
 mod sja1000;
 #[cfg(test)]
 mod tests;
-#[allow(dead_code, reason = "the formats that follow use the rest")]
 mod text;
 mod trc;
-#[allow(dead_code, reason = "the formats that follow use the rest")]
 mod writer;
 
+pub use analyser::{DifConvention, LineEnd, TableStyle};
+pub use csv::CsvDialect;
 pub use format::{Format, UnknownFormat};
 pub use issue::{Fault, Place, ReadIssue};
 pub use reader::{OpenError, ReadOptions, TraceReader, open_reader};

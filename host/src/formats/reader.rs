@@ -6,7 +6,7 @@ use std::sync::Arc;
 
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
-use super::{Format, UnknownFormat, asc, blf, candump, trc};
+use super::{Format, UnknownFormat, asc, blf, candump, csv, dif, pcapng, trc};
 use crate::TraceRecord;
 
 /// How to read.
@@ -90,6 +90,9 @@ impl TraceReader {
             Format::Asc => Box::new(asc::Decoder::default()),
             Format::Blf => Box::new(blf::Decoder::default()),
             Format::Trc(_) => Box::new(trc::Decoder::default()),
+            Format::Csv(_) => Box::new(csv::Decoder::default()),
+            Format::Pcapng => Box::new(pcapng::Decoder::default()),
+            Format::Dif => Box::new(dif::Decoder::default()),
         };
         Self { name, format, input, decoder, strict, issues: 0, ended: false }
     }

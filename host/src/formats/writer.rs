@@ -4,9 +4,11 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 
+use super::analyser::TableStyle;
+use super::csv::CsvDialect;
 use super::output::{Output, Patch};
 use super::rotate::{Rotating, Rotation};
-use super::{Format, asc, blf, candump, trc};
+use super::{Format, analyser, asc, blf, candump, csv, dif, pcapng, trc};
 use crate::TraceRecord;
 
 /// Bytes collected before they go to the system.
@@ -19,6 +21,8 @@ pub struct WriteOptions {
     pub format: Option<Format>,
     /// When to begin a new file.
     pub rotation: Rotation,
+    /// How the earlier CANanalyser's tables look.
+    pub table: TableStyle,
 }
 
 /// What a file could not carry: a description and how often.
@@ -133,12 +137,17 @@ impl FileWriter {
         Ok(Self::new(Output::create(path)?, format, options))
     }
 
-    pub(crate) fn new(output: Output, format: Format, _options: &WriteOptions) -> Self {
+    pub(crate) fn new(output: Output, format: Format, options: &WriteOptions) -> Self {
         let encoder: Box<dyn Encode> = match format {
             Format::Candump => Box::new(candump::Encoder),
             Format::Asc => Box::new(asc::Encoder::default()),
             Format::Blf => Box::new(blf::Encoder::default()),
             Format::Trc(version) => Box::new(trc::Encoder::new(version)),
+            Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
+            Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
+            Format::Csv(CsvDialect::Analyser) => Box::new(analyser::CsvEncoder::new(options.table)),
+            Format::Pcapng => Box::new(pcapng::Encoder::default()),
+            Format::Dif => Box::new(dif::Encoder::new(options.table)),
         };
         let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
         Self {

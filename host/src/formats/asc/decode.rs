@@ -7,7 +7,7 @@ use cantap_wire::{Frame, Id};
 use super::super::calendar::{Date, MONTHS};
 use super::super::event_text;
 use super::super::input::Input;
-use super::super::issue::{Fault, Place};
+use super::super::issue::Fault;
 use super::super::reader::{Decode, Found};
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
@@ -47,7 +47,7 @@ impl Decode for Decoder {
             match self.line(text) {
                 Ok(Content::Record(record)) => return Ok(Found::Record(record)),
                 Ok(Content::Other) => {}
-                Err(fault) => return Ok(Found::Issue(Place::Line(line.number), fault)),
+                Err(fault) => return Ok(line.issue(fault)),
             }
         }
         Ok(Found::End)

@@ -8,7 +8,7 @@ use cantap_wire::{Frame, Id};
 use super::super::calendar::{Date, NS_PER_DAY};
 use super::super::event_text;
 use super::super::input::Input;
-use super::super::issue::{Fault, Place};
+use super::super::issue::Fault;
 use super::super::reader::{Decode, Found};
 use super::super::text;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
@@ -96,7 +96,7 @@ impl Decode for Decoder {
             match result {
                 Ok(Some(record)) => return Ok(Found::Record(record)),
                 Ok(None) => {}
-                Err(fault) => return Ok(Found::Issue(Place::Line(line.number), fault)),
+                Err(fault) => return Ok(line.issue(fault)),
             }
         }
         Ok(Found::End)

@@ -206,7 +206,9 @@ impl Wire {
         let bit = controller.timing().bit();
         match controller.mode() {
             Mode::Synchronising { since } => Some(since.max(self.recessive) + SYNC_BITS * bit),
-            Mode::BusOff { left: Some(left) } => Some(self.recessive + u64::from(left) * SYNC_BITS * bit),
+            Mode::BusOff { left: Some(left), since } => {
+                Some(since.max(self.recessive) + u64::from(left) * SYNC_BITS * bit)
+            }
             _ => None,
         }
     }
@@ -412,9 +414,12 @@ impl Wire {
     /// Sequences of eleven recessive bits since the last frame, for controllers in bus-off.
     fn count_recovery(&self, can: &mut CanPair, start: u64) {
         for n in &self.attached {
-            let bit = can.controllers[*n].timing().bit();
-            let sequences = start.saturating_sub(self.recessive) / (SYNC_BITS * bit);
-            can.controllers[*n].recover(sequences as u32);
+            let controller = &mut can.controllers[*n];
+            if let Mode::BusOff { since, .. } = controller.mode() {
+                let from = since.max(self.recessive);
+                let sequences = start.saturating_sub(from) / (SYNC_BITS * controller.timing().bit());
+                controller.recover(sequences as u32);
+            }
         }
     }
 

@@ -78,6 +78,8 @@ pub enum Mode {
     BusOff {
         /// Sequences still to come.
         left: Option<u32>,
+        /// They count from this cycle on.
+        since: u64,
     },
 }
 
@@ -225,7 +227,7 @@ impl Controller {
 
     fn leave_initialisation(&mut self, now: u64) {
         self.mode = if self.counters.bus_off() {
-            Mode::BusOff { left: Some(RECOVERY_SEQUENCES) }
+            Mode::BusOff { left: Some(RECOVERY_SEQUENCES), since: now }
         } else {
             Mode::Synchronising { since: now }
         };
@@ -431,7 +433,7 @@ impl Controller {
         }
         if after.bus_off() {
             let automatic = self.mcr & mcr::ABOM != 0;
-            self.mode = Mode::BusOff { left: automatic.then_some(RECOVERY_SEQUENCES) };
+            self.mode = Mode::BusOff { left: automatic.then_some(RECOVERY_SEQUENCES), since: 0 };
         }
     }
 
@@ -458,7 +460,7 @@ impl Controller {
 
     /// `sequences` of eleven recessive bits have passed in bus-off.
     pub(crate) fn recover(&mut self, sequences: u32) {
-        if let Mode::BusOff { left: Some(left) } = &mut self.mode {
+        if let Mode::BusOff { left: Some(left), .. } = &mut self.mode {
             *left = left.saturating_sub(sequences);
             if *left == 0 {
                 self.mode = Mode::Normal;

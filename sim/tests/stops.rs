@@ -1,0 +1,120 @@
+//! Runs that end before their time: each says why, where, and who called.
+
+mod assembly;
+
+use assembly::{EQ, Program, adds, cmp, ldr, movs, nop, str, udf, wfi};
+use cantap_sim::memory_map::{CCM, FLASH, SRAM};
+use cantap_sim::{CYCLES_PER_SECOND, ElfError, Image, Machine, Reason, Setup, Stopped};
+
+const SECOND: u64 = CYCLES_PER_SECOND;
+
+fn stop(program: Program, setup: Setup) -> Stopped {
+    Machine::new(program.image(), setup).run_until(SECOND).expect_err("the program ends the run")
+}
+
+#[test]
+fn an_undefined_instruction_is_a_hard_fault_at_its_address() {
+    let mut program = Program::new();
+    program.handler(1);
+    program.put(&[nop(), nop()]);
+    let fault = program.here();
+    program.put(&[udf()]);
+    let stopped = stop(program, Setup::default());
+    assert!(matches!(stopped.reason, Reason::HardFault([cfsr, ..]) if cfsr & 1 << 16 != 0), "{stopped}");
+    assert_eq!(stopped.pc, fault);
+}
+
+#[test]
+fn an_access_to_nowhere_tells_its_address() {
+    let mut program = Program::new();
+    program.handler(1);
+    program.load(0, CCM.end);
+    program.put(&[str(0, 0, 0)]);
+    let stopped = stop(program, Setup::default());
+    assert!(matches!(stopped.reason, Reason::HardFault([_, _, _, bfar]) if bfar == CCM.end), "{stopped}");
+}
+
+#[test]
+fn an_unfed_watchdog_ends_the_run_or_restarts_the_firmware() {
+    let program = || {
+        let mut program = Program::new();
+        program.handler(1);
+        // Count the starts, start the watchdog with its reset values (512 ms), then sleep.
+        program.load(0, SRAM.start);
+        program.put(&[ldr(1, 0, 0), adds(1, 1), str(1, 0, 0)]);
+        program.load(0, 0x4000_3000);
+        program.load(1, 0xCCCC);
+        program.put(&[str(1, 0, 0)]);
+        let sleep = program.here();
+        program.put(&[wfi()]);
+        program.branch_to(sleep);
+        program
+    };
+    let stopped = stop(program(), Setup::default());
+    assert_eq!(stopped.reason, Reason::Watchdog);
+    // 4 × 4096 ticks of 32 kHz.
+    assert_eq!(stopped.at / (SECOND / 1000), 512);
+    let mut machine = Machine::new(program().image(), Setup { survive_watchdog: true, ..Setup::default() });
+    machine.run_until(2 * SECOND).unwrap();
+    assert_eq!((machine.resets(), machine.cpu().word(SRAM.start)), (3, Some(4)));
+}
+
+#[test]
+fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
+    let program = || {
+        let mut program = Program::new();
+        // Two starts ask for a reset, the third sleeps.
+        let sleep = program.here();
+        program.put(&[wfi()]);
+        program.branch_to(sleep);
+        program.handler(1);
+        program.load(0, SRAM.start);
+        program.put(&[ldr(1, 0, 0), adds(1, 1), str(1, 0, 0), movs(2, 3), cmp(1, 2)]);
+        program.branch_if(EQ, sleep);
+        program.load(0, 0xE000_ED0C);
+        program.load(1, 0x05FA_0004);
+        program.put(&[str(1, 0, 0)]);
+        let wait = program.here();
+        program.branch_to(wait);
+        program
+    };
+    assert_eq!(stop(program(), Setup { stop_on_reset: true, ..Setup::default() }).reason, Reason::Reset);
+    let mut machine = Machine::new(program().image(), Setup::default());
+    machine.run_until(SECOND).unwrap();
+    assert_eq!((machine.resets(), machine.cpu().word(SRAM.start)), (2, Some(3)));
+    assert!(machine.cpu().asleep());
+}
+
+#[test]
+fn a_file_that_cannot_run_is_refused_in_one_line() {
+    let elf = |machine: u16, address: u32| {
+        let mut bytes = Vec::new();
+        bytes.extend([0x7F, b'E', b'L', b'F', 1, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0]);
+        for half in [2, machine] {
+            bytes.extend(u16::to_le_bytes(half));
+        }
+        for word in [1, address | 1, 52, 0, 0] {
+            bytes.extend(u32::to_le_bytes(word));
+        }
+        for half in [52u16, 32, 1, 40, 0, 0] {
+            bytes.extend(half.to_le_bytes());
+        }
+        // One segment of 8 bytes: stack and reset vector.
+        for word in [1, 84, address, address, 8, 8, 5, 4, SRAM.end, address + 9] {
+            bytes.extend(u32::to_le_bytes(word));
+        }
+        bytes
+    };
+    const ARM: u16 = 40;
+    const X86_64: u16 = 62;
+    assert!(matches!(Image::firmware(b"#!/bin/sh\n"), Err(ElfError::NotElf)));
+    assert!(matches!(Image::firmware(&elf(X86_64, FLASH.start)), Err(ElfError::OtherMachine { .. })));
+    assert!(matches!(Image::firmware(&elf(ARM, 0x1_0000)), Err(ElfError::OtherMemoryMap { .. })));
+    assert!(matches!(Image::firmware(&elf(ARM, FLASH.start)), Err(ElfError::NoProtocolVersion)));
+    for bytes in [b"#!/bin/sh\n".to_vec(), elf(X86_64, FLASH.start), elf(ARM, 0), elf(ARM, FLASH.start)] {
+        let message = Image::firmware(&bytes).unwrap_err().to_string();
+        assert!(!message.contains('\n') && message.len() > 20, "{message}");
+    }
+    let newer = ElfError::ProtocolMismatch { firmware: cantap_wire::PROTOCOL_VERSION + 1 };
+    assert!(newer.to_string().ends_with("update the emulator"));
+}

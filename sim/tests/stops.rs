@@ -7,6 +7,9 @@ use cantap_sim::memory_map::{CCM, FLASH, SRAM};
 use cantap_sim::{CYCLES_PER_SECOND, ElfError, Image, Machine, Reason, Setup, Stopped};
 
 const SECOND: u64 = CYCLES_PER_SECOND;
+/// Machine numbers in an ELF's header.
+const ARM: u16 = 40;
+const X86_64: u16 = 62;
 
 fn stop(program: Program, setup: Setup) -> Stopped {
     Machine::new(program.image(), setup).run_until(SECOND).expect_err("the program ends the run")
@@ -105,8 +108,6 @@ fn a_file_that_cannot_run_is_refused_in_one_line() {
         }
         bytes
     };
-    const ARM: u16 = 40;
-    const X86_64: u16 = 62;
     assert!(matches!(Image::firmware(b"#!/bin/sh\n"), Err(ElfError::NotElf)));
     assert!(matches!(Image::firmware(&elf(X86_64, FLASH.start)), Err(ElfError::OtherMachine { .. })));
     assert!(matches!(Image::firmware(&elf(ARM, 0x1_0000)), Err(ElfError::OtherMemoryMap { .. })));

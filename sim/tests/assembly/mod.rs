@@ -70,7 +70,8 @@ impl Program {
         let base = self.code.len();
         for (n, (at, value)) in std::mem::take(&mut self.literals).into_iter().enumerate() {
             // Relative to the instruction's address plus 4, rounded down to a word.
-            let words = (base + 2 * n - (at + 2) / 2 * 2) / 2;
+            let from = (at + 2) & !1;
+            let words = (base + 2 * n - from) / 2;
             self.code[at] |= words as u16;
             self.code.extend([value as u16, (value >> 16) as u16]);
         }

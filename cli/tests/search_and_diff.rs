@@ -25,7 +25,9 @@ fn cantap(test: &str, arguments: &[&str]) -> (Option<i32>, String, String) {
     std::fs::create_dir_all(&directory).unwrap();
     let log = |frames: &[&str], step: usize| -> String {
         let lines = frames.iter().enumerate();
-        lines.map(|(at, frame)| format!("({}.000000) can0 {frame}\n", at * step)).collect()
+        let lines: Vec<_> =
+            lines.map(|(at, frame)| format!("({}.000000) can0 {frame}\n", at * step)).collect();
+        lines.concat()
     };
     for (name, content) in [
         ("car.dbc", DATABASE.to_owned()),

@@ -36,7 +36,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     let Some(dbc) = parse_leniently(&text, &index, &mut faults) else {
         return Err(faulty(faults));
     };
-    let messages = Reader::new(&dbc, &text, &index, &mut faults).messages();
+    let messages = Reader::new(&dbc, &index, &mut faults).messages();
     validate::finish(file, messages, faults)
 }
 
@@ -54,7 +54,7 @@ fn parse_leniently(text: &str, index: &Index, faults: &mut Vec<Fault>) -> Option
         let statement = index.statement_at(line);
         if let Some(needless) = statement.filter(|statement| statement.is_needless())
             && faults.len() < MAX_IGNORED
-            && !text[needless.range.clone()].trim().is_empty()
+            && can_be_left_out(&text[needless.range.clone()])
         {
             let (line, symbol) = (needless.line, needless.symbol.clone());
             faults.push(Fault { line, symbol, kind: FaultKind::Ignored(reason) });
@@ -68,6 +68,11 @@ fn parse_leniently(text: &str, index: &Index, faults: &mut Vec<Fault>) -> Option
         faults.push(Fault { line, symbol, kind: FaultKind::Syntax(reason) });
         return None;
     }
+}
+
+/// Whether a statement is still there, and has not swallowed definitions because a quote is missing.
+fn can_be_left_out(statement: &str) -> bool {
+    !statement.trim().is_empty() && !statement.contains("\nBO_ ") && !statement.contains("\n SG_ ")
 }
 
 /// What a statement looks like. can-dbc's errors mostly point at its start and name rules of a grammar
@@ -153,7 +158,7 @@ struct Reader<'a> {
 }
 
 impl<'a> Reader<'a> {
-    fn new(dbc: &'a Dbc, text: &str, index: &'a Index, faults: &'a mut Vec<Fault>) -> Self {
+    fn new(dbc: &'a Dbc, index: &'a Index, faults: &'a mut Vec<Fault>) -> Self {
         let mut messages = HashMap::<_, MessageExtras>::new();
         let mut signals = HashMap::<_, SignalExtras>::new();
         for message in &dbc.messages {
@@ -163,9 +168,8 @@ impl<'a> Reader<'a> {
             }
         }
         let mut unknown = |keyword: &str, id: MessageId, signal: &str| {
-            let id = id.raw().to_string();
-            let line = index.find(text, keyword, &[&id, signal]).map_or(0, |statement| statement.line);
-            let symbol = format!("{keyword} {id} {signal}");
+            let line = index.reference_line(keyword, id.raw(), signal);
+            let symbol = format!("{keyword} {} {signal}", id.raw());
             faults.push(Fault { line, symbol, kind: FaultKind::UnknownSymbol });
         };
         for comment in &dbc.comments {

@@ -83,6 +83,8 @@ pub struct Index {
     pub messages: Vec<(u64, String, u32)>,
     /// Lines of signals by their message's place in `messages` and their name.
     signals: HashMap<(usize, String), u32>,
+    /// Lines of the first statement about a signal, by keyword, message identifier and name.
+    references: HashMap<(String, String, String), u32>,
 }
 
 impl Index {
@@ -139,7 +141,13 @@ impl Index {
                 }
                 symbol
             }
-            _ => [keyword, first, second].join(" ").trim_end().to_owned(),
+            _ => {
+                if NEEDED.contains(&keyword) {
+                    let reference = (keyword.to_owned(), first.to_owned(), second.to_owned());
+                    self.references.entry(reference).or_insert(number);
+                }
+                [keyword, first, second].join(" ").trim_end().to_owned()
+            }
         };
         let range = offset..offset;
         self.statements.push(Statement { line: number, range, keyword: keyword.to_owned(), symbol });
@@ -161,15 +169,10 @@ impl Index {
         self.statements.get(after.checked_sub(1)?)
     }
 
-    /// The first statement of that keyword whose words after it are those.
-    pub fn find(&self, text: &str, keyword: &str, words: &[&str]) -> Option<&Statement> {
-        self.statements.iter().find(|statement| {
-            let mut found =
-                text[statement.range.clone()].split([' ', '\t', ':', ';']).filter(|w| !w.is_empty());
-            statement.keyword == keyword
-                && found.next() == Some(keyword)
-                && words.iter().all(|&word| found.next() == Some(word))
-        })
+    /// The line of the first statement of that keyword about a signal; 0 if unknown.
+    pub fn reference_line(&self, keyword: &str, id: u32, signal: &str) -> u32 {
+        let reference = (keyword.to_owned(), id.to_string(), signal.to_owned());
+        self.references.get(&reference).copied().unwrap_or_default()
     }
 }
 
@@ -189,10 +192,12 @@ fn ends_in_string(line: &str, mut in_string: bool) -> bool {
     in_string
 }
 
-/// Replaces a statement by spaces, so that everything else keeps its place.
+/// Replaces a statement by as many spaces as it has bytes, so that everything else keeps its place.
 pub fn blank(text: &str, range: Range<usize>) -> String {
-    let spaces = text[range.clone()].chars().map(|c| if c == '\n' || c == '\r' { c } else { ' ' });
     let mut blanked = text[..range.start].to_owned();
+    let spaces = text[range.clone()]
+        .bytes()
+        .map(|byte| if byte == b'\n' || byte == b'\r' { byte.into() } else { ' ' });
     blanked.extend(spaces);
     blanked.push_str(&text[range.end..]);
     blanked
@@ -236,5 +241,6 @@ mod tests {
         assert_eq!(blanked.lines().count(), TEXT.lines().count());
         assert_eq!(Index::of(&blanked).signal_line(1, "One"), 13);
         assert!(!blanked.contains("Neither"));
+        assert_eq!(blank("a\nµ°\nb", 2..7), "a\n    \nb");
     }
 }

@@ -6,7 +6,7 @@ use cantap_wire::Frame;
 
 use super::decoder::{Decoder, MessageRef};
 use super::layout;
-use super::model::{Message, Signal, ValueKind};
+use super::model::{MAX_SWITCHES, Message, Multiplexed, Signal, ValueKind};
 use super::select::Suggestion;
 
 /// A frame made from values.
@@ -212,12 +212,12 @@ fn input(text: &str) -> Input {
 fn integer(text: &str) -> Option<i128> {
     let (sign, digits) = text.strip_prefix('-').map_or((1, text), |digits| (-1, digits));
     let magnitude = match digits.strip_prefix("0x").or_else(|| digits.strip_prefix("0X")) {
-        // 64 bits are enough for every signal, and keep the arithmetic below from overflowing.
-        Some(hex) if !hex.starts_with('+') => u64::from_str_radix(hex, 16).ok()?,
+        Some(hex) if !hex.starts_with('+') => u128::from_str_radix(hex, 16).ok()?,
         _ if digits.starts_with('+') => return None,
         _ => digits.parse().ok()?,
     };
-    Some(sign * i128::from(magnitude))
+    // A 64-bit value times any factor that makes sense; and nothing below can overflow.
+    i128::try_from(magnitude).ok().filter(|magnitude| *magnitude < 1 << 120).map(|magnitude| sign * magnitude)
 }
 
 fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<MessageRef, EncodeError> {
@@ -254,7 +254,7 @@ pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<V
             EncodeError::UnknownSignal { message: message.name.clone(), name: name.clone(), near }
         })?;
         let signal = &message.signals[place];
-        if signal.bytes_needed() > message.length.into() {
+        if !fits(message, signal) {
             let (what, bytes) = (format!("signal {name}"), signal.bytes_needed());
             return Err(EncodeError::TooLong { what, bytes, room: "its message has fewer" });
         }
@@ -271,12 +271,21 @@ pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<V
     let (last, first): (Vec<_>, Vec<_>) = (0..message.signals.len()).partition(|place| given.contains(place));
     for place in first.into_iter().chain(last) {
         let signal = &message.signals[place];
-        let fits = signal.bytes_needed() <= message.length.into();
-        if fits && is_present(&message.signals, place, &raw_of) {
+        if fits(message, signal) && is_present(&message.signals, place, &raw_of) {
             layout::insert(signal.order, signal.start, signal.length, raw_of(place), &mut data);
         }
     }
     Ok(data)
+}
+
+/// Whether the signal can be written. A database made by a program may have signals without bits.
+fn fits(message: &Message, signal: &Signal) -> bool {
+    (1..=64).contains(&signal.length) && signal.bytes_needed() <= message.length.into()
+}
+
+/// What a signal depends on, if it is in this message.
+fn multiplexed(signals: &[Signal], place: usize) -> Option<&Multiplexed> {
+    signals[place].multiplexed.as_ref().filter(|multiplexed| multiplexed.switch < signals.len())
 }
 
 /// Gives every multiplexer that the given signals need, and that is not given itself, a value.
@@ -288,7 +297,7 @@ fn choose_switches(
     let mut demands: BTreeMap<usize, BTreeSet<usize>> = BTreeMap::new();
     for &place in given {
         let mut at = place;
-        while let Some(multiplexed) = &signals[at].multiplexed {
+        while let Some(multiplexed) = multiplexed(signals, at) {
             if !demands.entry(multiplexed.switch).or_default().insert(at) {
                 break;
             }
@@ -296,7 +305,7 @@ fn choose_switches(
         }
     }
     for (switch, dependents) in demands {
-        let wanted = |place: usize| signals[place].multiplexed.as_ref();
+        let wanted = |place: usize| multiplexed(signals, place);
         let refused = |raw| {
             let refuses = |&place: &usize| wanted(place).is_some_and(|multiplexed| !multiplexed.matches(raw));
             dependents.iter().copied().find(|place| refuses(place))
@@ -327,9 +336,9 @@ fn choose_switches(
 
 fn is_present(signals: &[Signal], place: usize, raw_of: &impl Fn(usize) -> u64) -> bool {
     let mut at = place;
-    // A chain cannot be longer than the message; a database from a file has no circle.
-    for _ in signals {
-        let Some(multiplexed) = &signals[at].multiplexed else { return true };
+    // Files are checked for circles; a database made by a program may have one.
+    for _ in 0..=MAX_SWITCHES {
+        let Some(multiplexed) = multiplexed(signals, at) else { return true };
         if !multiplexed.matches(raw_of(multiplexed.switch)) {
             return false;
         }

@@ -121,9 +121,9 @@ pub enum FaultKind {
     /// A multiplexed signal whose multiplexer is not there.
     #[error("there is no multiplexer {0:?} in this message; the signal is taken as always present")]
     NoMultiplexer(String),
-    /// Multiplexers that depend on each other.
-    #[error("the signal is multiplexed by itself through {0:?}")]
-    MultiplexerCycle(String),
+    /// Multiplexers that depend on each other, or too many of them.
+    #[error("the signal is multiplexed by itself through {0:?}, or through more than {max} others", max = super::model::MAX_SWITCHES)]
+    Multiplexers(String),
     /// A statement about a message or signal that is not there.
     #[error("there is no such message or signal; the statement is left out")]
     UnknownSymbol,

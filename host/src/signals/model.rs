@@ -10,6 +10,9 @@ use super::fault::Fault;
 use super::layout;
 use super::number::Number;
 
+/// Through so many multiplexers a signal may be multiplexed. Databases have two or three.
+pub(super) const MAX_SWITCHES: usize = 16;
+
 /// A set of messages, from one file.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Database {

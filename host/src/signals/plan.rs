@@ -7,7 +7,7 @@
 use std::ops::RangeInclusive;
 
 use super::layout;
-use super::model::{ByteOrder, Message, Signal, ValueKind};
+use super::model::{ByteOrder, MAX_SWITCHES, Message, Signal, ValueKind};
 
 /// One decoded signal.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -188,8 +188,8 @@ fn conditions(signals: &[Signal], signal: &Signal) -> Option<Vec<Condition>> {
     let mut conditions = Vec::new();
     let mut at = signal;
     while let Some(multiplexed) = &at.multiplexed {
-        // A chain as long as the message is a circle.
-        let switch = signals.get(multiplexed.switch).filter(|_| conditions.len() < signals.len())?;
+        // Files are checked for circles; a database made by a program may have one.
+        let switch = signals.get(multiplexed.switch).filter(|_| conditions.len() < MAX_SWITCHES)?;
         conditions.push(Condition { switch: Field::of(switch)?, values: multiplexed.values.clone() });
         at = switch;
     }

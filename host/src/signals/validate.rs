@@ -3,7 +3,7 @@
 use std::collections::{HashMap, HashSet};
 
 use super::fault::{DatabaseError, Fault, FaultKind};
-use super::model::{Database, Message, Signal, ValueKind};
+use super::model::{Database, MAX_SWITCHES, Message, Signal, ValueKind};
 
 /// The longest message: J1939's transport protocol carries 1785 bytes.
 pub const MAX_BYTES: u16 = 1785;
@@ -63,7 +63,7 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
             report(signal, FaultKind::OutsideMessage { needed, length });
         }
         if let Some(first) = switch_cycle(&message.signals, signal) {
-            report(signal, FaultKind::MultiplexerCycle(first.name.clone()));
+            report(signal, FaultKind::Multiplexers(first.name.clone()));
         }
     }
     let switches: Vec<_> =
@@ -73,11 +73,11 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
     }
 }
 
-/// The signal's multiplexer, if following multiplexers from it never ends.
+/// The signal's multiplexer, if following multiplexers from it does not end soon.
 fn switch_cycle<'a>(signals: &'a [Signal], signal: &'a Signal) -> Option<&'a Signal> {
     let first = &signals[signal.multiplexed.as_ref()?.switch];
     let mut at = first;
-    for _ in signals {
+    for _ in 0..MAX_SWITCHES {
         at = &signals[at.multiplexed.as_ref()?.switch];
     }
     Some(first)

@@ -38,6 +38,12 @@ pub fn duration(text: &str) -> Result<Duration, String> {
         .ok_or_else(|| "write a time as a number and a unit, such as 400ms, 3s or 2m".to_owned())
 }
 
+/// A share in per cent, 0 to 100.
+pub fn percent(text: &str) -> Result<f64, String> {
+    let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();
+    number.filter(|number| (0.0..=100.0).contains(number)).ok_or_else(|| "give per cent, 0 to 100".to_owned())
+}
+
 /// Channels of a device, as `1`, `2` or `both`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Channels(&'static [Channel]);

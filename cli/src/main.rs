@@ -5,6 +5,8 @@ mod commands;
 mod databases;
 mod input;
 mod interrupt;
+mod losses;
+mod meter;
 mod timing_args;
 
 use std::process::ExitCode;

@@ -5,8 +5,8 @@ use std::io::Read;
 use std::time::{Duration, Instant};
 
 use cantap::device::{Device, Link};
-use cantap::simbus::{FrameSource, Frames};
-use cantap::virtual_device::{Options, Pace, start};
+use cantap::simbus::Frames;
+use cantap::virtual_device::{Options, Pace, SequenceCheck, start};
 use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Mode, TxFrame};
 use cantap::wire::record::{BusErrorKind, ErrorState, TransmitFailure};
 use cantap::{Channel, Direction, Frame, TraceEvent, TraceRecord};
@@ -42,29 +42,16 @@ fn collect(device: &Device, mut enough: impl FnMut(&TraceRecord) -> bool) -> Vec
     panic!("{} records and not what was waited for", taken.len());
 }
 
-/// Holds each channel's records against the sequence that was sent: a frame must be the next, a loss counts as
-/// so many. Returns delivered and lost.
+/// Checks the law of counting on both channels. Returns what each delivered and lost.
 fn check_law(records: &[TraceRecord], options: &Options, heard: [u64; 2]) -> ([u64; 2], [u64; 2]) {
-    let mut sources: [FrameSource; 2] = [options.source(0), options.source(1)];
-    let (mut delivered, mut lost) = ([0; 2], [0; 2]);
+    let mut checks = [0, 1].map(|channel| SequenceCheck::new(options.source(channel)));
     for record in records {
-        let channel = usize::from(record.channel - 1);
-        match record.event {
-            TraceEvent::Frame { frame, .. } => {
-                assert_eq!(Some(frame), sources[channel].next(), "channel {}", record.channel);
-                delivered[channel] += 1;
-            }
-            TraceEvent::Lost { count, at_least: false, .. } if count > 0 => {
-                sources[channel].nth(count as usize - 1);
-                lost[channel] += u64::from(count);
-            }
-            ref other => panic!("{other:?}"),
-        }
+        checks[usize::from(record.channel - 1)].push(record);
     }
-    for channel in 0..2 {
-        assert_eq!(delivered[channel] + lost[channel], heard[channel]);
+    for (check, sent) in checks.iter().zip(heard) {
+        assert!(check.holds(sent), "{} delivered + {} lost of {sent}", check.delivered(), check.lost());
     }
-    (delivered, lost)
+    (checks.each_ref().map(SequenceCheck::delivered), checks.each_ref().map(SequenceCheck::lost))
 }
 
 #[test]
@@ -252,4 +239,26 @@ fn behind_a_pseudo_terminal_it_is_a_serial_port_and_can_be_opened_again() {
     }
     drop(terminal);
     assert!(Device::open(&address).is_err());
+}
+
+#[test]
+fn a_log_is_replayed_at_its_own_times() {
+    let file = tempfile::NamedTempFile::with_suffix(".log").unwrap();
+    let lines = "(100.000000) can0 123#11\n(100.000500) can1 456#22\n(100.010000) can0 124#33\n";
+    std::fs::write(file.path(), lines).unwrap();
+    let options: Options = format!("pace=fast,log={}", file.path().display()).parse().unwrap();
+    let device = open(options);
+    for channel in Channel::ALL {
+        device.listen(channel, BITRATE).unwrap();
+    }
+    let mut count = 0;
+    let records = collect(&device, |_| {
+        count += 1;
+        count == 3
+    });
+    let of = |channel| records.iter().filter(move |record: &&TraceRecord| record.channel == channel);
+    let texts = |channel| of(channel).map(|record| record.frame().unwrap().to_string()).collect::<Vec<_>>();
+    assert_eq!((texts(1), texts(2)), (vec!["123#11".into(), "124#33".into()], vec!["456#22".into()]));
+    let times: Vec<i64> = of(1).map(|record| record.time_ns).collect();
+    assert!((times[1] - times[0] - 10_000_000).abs() < 5000, "{times:?}");
 }

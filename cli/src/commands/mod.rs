@@ -1,12 +1,19 @@
 //! The subcommands. Each file has an `Args` for its command line and a `run`.
 
 pub mod bits;
+pub mod capture;
+pub mod completions;
 pub mod decode;
+pub mod demo;
 pub mod diff;
+pub mod info;
+pub mod list;
 pub mod plot;
 pub mod search;
 pub mod stats;
 pub mod timing;
+#[cfg(unix)]
+pub mod virtual_device;
 
 use std::process::ExitCode;
 
@@ -19,14 +26,27 @@ pub enum Command {
     Plot(plot::Args),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
     Stats(stats::Args),
-    /// Show a trace as signals, by DBC or signal file.
-    Decode(decode::Args),
     /// Show what two traces say differently: IDs, periods, lengths, bits.
     Diff(diff::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
     Search(search::Args),
     /// List every bit timing of a bit rate, what each is worth, and the one to choose.
     Timing(timing::Args),
+    /// Capture what a device hears into a file.
+    Capture(capture::Args),
+    /// Print the completion script of a shell.
+    Completions(completions::Args),
+    /// Show a trace as signals, by DBC or signal file.
+    Decode(decode::Args),
+    /// Capture the worst traffic there is, without a board, and check that nothing is lost silently.
+    Demo(demo::Args),
+    /// Show what a device is.
+    Info(info::Args),
+    /// List connected boards.
+    List(list::Args),
+    /// Run a virtual device behind a pseudo terminal.
+    #[cfg(unix)]
+    Virtual(virtual_device::Args),
 }
 
 impl Command {
@@ -36,10 +56,17 @@ impl Command {
             Self::Bits(args) => bits::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Stats(args) => stats::run(&args),
-            Self::Decode(args) => decode::run(&args),
             Self::Diff(args) => diff::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),
+            Self::Capture(args) => capture::run(&args),
+            Self::Completions(args) => completions::run(&args),
+            Self::Decode(args) => decode::run(&args),
+            Self::Demo(args) => demo::run(&args),
+            Self::Info(args) => info::run(&args),
+            Self::List(args) => list::run(&args),
+            #[cfg(unix)]
+            Self::Virtual(args) => virtual_device::run(&args),
         }
     }
 }

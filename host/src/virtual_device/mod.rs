@@ -9,13 +9,16 @@
 //! time to read that it missed as well.
 
 mod board;
+mod check;
 mod controller;
+mod log;
 mod machine;
 mod options;
 #[cfg(all(unix, feature = "serial"))]
 mod pty;
 mod runner;
 
+pub use check::SequenceCheck;
 pub use machine::{Heard, Witness};
 pub use options::{BadOption, Options, Pace};
 #[cfg(all(unix, feature = "serial"))]

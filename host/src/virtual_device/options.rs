@@ -1,6 +1,7 @@
 //! What the virtual device is told after `virtual:`.
 
 use std::fmt::Display;
+use std::path::Path;
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -25,7 +26,7 @@ pub enum Pace {
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
 /// in a burst, and its period), `errors` (per cent of the frames destroyed), `ack` (`yes`, `no`), `seed`, `pace`
 /// (`real`, `fast`), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `channels` (`1`, `2` or `both`:
-/// those with traffic).
+/// those with traffic), and at the end `log=FILE` (a trace file, replayed at its own times).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// Bus load in per cent, 0 to 100.
@@ -93,9 +94,17 @@ pub enum BadOption {
 impl FromStr for Options {
     type Err = BadOption;
 
-    /// An empty text means the defaults. `log` is not among the keys: whoever opens the device reads the file.
+    /// An empty text means the defaults.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut options = Self::default();
+        // A file's name may have commas: it takes the rest.
+        let (text, log) = match text.strip_prefix("log=") {
+            Some(file) => ("", Some(file)),
+            None => text.split_once(",log=").map_or((text, None), |(text, file)| (text, Some(file))),
+        };
+        if let Some(file) = log {
+            options.read_log(Path::new(file))?;
+        }
         for option in text.split(',').filter(|option| !option.is_empty()) {
             let (key, value) = option.split_once('=').unwrap_or((option, ""));
             options.set(key, value)?;

@@ -1,0 +1,267 @@
+//! `cantap capture`: what a device hears, into a file.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use cantap::device::Records;
+use cantap::formats::{Format, TraceWriter, WriteOptions, create_writer};
+use cantap::{Address, Channel, Device, TraceRecord};
+
+use crate::args;
+use crate::interrupt;
+use crate::losses::Losses;
+use crate::meter::{Meter, rounded};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Channels only listen: nothing is sent and nothing acknowledged.\n\
+                        Without -o the trace goes to standard output, unless --json is given.\n\n\
+                        Examples:\n  cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
+                        cantap capture -d virtual -b 1M -n 1000\n  \
+                        cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json")]
+pub struct Args {
+    /// Where the device is: a serial port, or virtual.
+    #[arg(short, long)]
+    device: Address,
+    /// Which channels: 1, 2 or both.
+    #[arg(short, long, default_value = "both", value_parser = args::channels)]
+    channel: args::Channels,
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M.
+    #[arg(short, long, value_parser = args::bitrate)]
+    bitrate: u32,
+    /// File to write; its suffix picks the format. Without a suffix it is a candump log.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// End after so many frames.
+    #[arg(short = 'n', long, value_name = "N")]
+    frames: Option<u64>,
+    /// End after this time, as 10, 500ms or 2m.
+    #[arg(short, long, value_parser = args::duration)]
+    time: Option<Duration>,
+    /// Print one JSON object with the summary.
+    #[arg(long)]
+    json: bool,
+}
+
+/// How long records may stay in memory while others follow slowly.
+const FLUSH_EVERY: Duration = Duration::from_millis(200);
+/// How often the end is looked for while nothing arrives.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+
+/// A channel in the JSON object.
+#[derive(serde::Serialize)]
+struct ChannelSummary {
+    channel: u8,
+    frames: u64,
+    lost: u64,
+    frames_per_s: f64,
+    bus_load_pct: f64,
+}
+
+#[derive(serde::Serialize)]
+struct Summary {
+    seconds: f64,
+    channels: Vec<ChannelSummary>,
+    lost: Losses,
+    clock_drift_ppm: Option<f64>,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    interrupt::watch()?;
+    let device = Device::open(&args.device)?;
+    let mut sink = Sink::create(args)?;
+    // Checked for all channels before any of them is opened.
+    device.timing(args.bitrate)?;
+    for channel in args.channel.iter() {
+        device.listen(channel, args.bitrate)?;
+    }
+    let started = Instant::now();
+    let mut meters = [Meter::new(args.bitrate), Meter::new(args.bitrate)];
+    let mut records = device.records();
+    let end = write_until_asked(args, &mut records, &mut sink, &mut meters, started);
+    // What was captured until now is written, whatever came in between.
+    let seconds = started.elapsed().as_secs_f64();
+    let end = end.and_then(|end| match end {
+        End::Asked => {
+            device.stop()?;
+            drain(args, &mut records, &mut sink, &mut meters)
+        }
+        End::Enough | End::NobodyReads => Ok(device.stop().map(|_| ())?),
+    });
+    let finished = sink.finish();
+    let summary = Summary {
+        seconds: rounded(seconds, 3),
+        channels: args.channel.iter().map(|channel| summarize(channel, &meters)).collect(),
+        lost: Losses::of(&device.counters()),
+        clock_drift_ppm: device.clock().drift_ppm.map(|ppm| rounded(ppm, 2)),
+    };
+    report(args, &summary)?;
+    end?;
+    finished?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Why writing ended.
+enum End {
+    /// By the user or the time limit: what has been captured is still wanted.
+    Asked,
+    /// By the frame limit.
+    Enough,
+    /// The reader of our standard output went away.
+    NobodyReads,
+}
+
+fn write_until_asked(
+    args: &Args,
+    records: &mut Records,
+    sink: &mut Sink,
+    meters: &mut [Meter; 2],
+    started: Instant,
+) -> anyhow::Result<End> {
+    let mut flushed = Instant::now();
+    loop {
+        if interrupt::requested() || args.time.is_some_and(|time| started.elapsed() >= time) {
+            return Ok(End::Asked);
+        }
+        let Some(batch) = records.next_batch(LOOK_EVERY)? else { return Ok(End::Enough) };
+        for record in &batch {
+            meters[usize::from(record.channel == 2)].push(record);
+            if !sink.write(record)? {
+                return Ok(End::NobodyReads);
+            }
+            if is_enough(args, meters) {
+                return Ok(End::Enough);
+            }
+        }
+        records.recycle(batch);
+        if flushed.elapsed() >= FLUSH_EVERY {
+            if !sink.flush()? {
+                return Ok(End::NobodyReads);
+            }
+            flushed = Instant::now();
+        }
+    }
+}
+
+/// Writes what had been captured when the channels were closed.
+fn drain(args: &Args, records: &mut Records, sink: &mut Sink, meters: &mut [Meter; 2]) -> anyhow::Result<()> {
+    for record in records {
+        let record = record?;
+        if is_enough(args, meters) || !sink.write(&record)? {
+            break;
+        }
+        meters[usize::from(record.channel == 2)].push(&record);
+    }
+    Ok(())
+}
+
+fn is_enough(args: &Args, meters: &[Meter; 2]) -> bool {
+    args.frames.is_some_and(|frames| meters.iter().map(Meter::frames).sum::<u64>() >= frames)
+}
+
+fn summarize(channel: Channel, meters: &[Meter; 2]) -> ChannelSummary {
+    let meter = &meters[channel.index()];
+    ChannelSummary {
+        channel: channel.number(),
+        frames: meter.frames(),
+        lost: meter.lost(),
+        frames_per_s: rounded(meter.frames_per_s(), 1),
+        bus_load_pct: rounded(meter.bus_load_pct(), 2),
+    }
+}
+
+fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
+    if args.json {
+        writeln!(io::stdout().lock(), "{}", serde_json::to_string(summary)?)?;
+        return Ok(());
+    }
+    eprintln!("captured {} s", summary.seconds);
+    for channel in &summary.channels {
+        let ChannelSummary { channel, frames, lost, frames_per_s, bus_load_pct } = channel;
+        eprintln!(
+            "channel {channel}: {frames} frames, {frames_per_s} frames/s, bus load {bus_load_pct} %, {lost} lost"
+        );
+    }
+    eprintln!("lost: {}", summary.lost.line());
+    if let Some(ppm) = summary.clock_drift_ppm {
+        eprintln!("the device's clock runs {ppm} ppm faster than this computer's");
+    }
+    Ok(())
+}
+
+/// Where records go.
+struct Sink {
+    writer: Option<Box<dyn TraceWriter>>,
+    name: String,
+    to_stdout: bool,
+}
+
+impl Sink {
+    fn create(args: &Args) -> anyhow::Result<Self> {
+        let path = match &args.output {
+            Some(path) => path.as_path(),
+            // Standard output is for one JSON object then.
+            None if args.json => return Ok(Self { writer: None, name: String::new(), to_stdout: false }),
+            None => Path::new("-"),
+        };
+        let format = path.extension().is_none().then_some(Format::Candump);
+        let options = WriteOptions { format, ..WriteOptions::default() };
+        let name = path.display().to_string();
+        let writer = create_writer(path, &options).with_context(|| {
+            format!("cannot write to '{name}'; choose a folder and name that you may write")
+        })?;
+        Ok(Self { writer: Some(writer), to_stdout: name == "-", name })
+    }
+
+    /// Writes a record. Returns whether anybody still reads.
+    fn write(&mut self, record: &TraceRecord) -> anyhow::Result<bool> {
+        let result = self.writer.as_mut().map_or(Ok(()), |writer| writer.write(record));
+        self.judge(result)
+    }
+
+    fn flush(&mut self) -> anyhow::Result<bool> {
+        let result = self.writer.as_mut().map_or(Ok(()), |writer| writer.flush());
+        self.judge(result)
+    }
+
+    fn judge(&mut self, result: io::Result<()>) -> anyhow::Result<bool> {
+        match result {
+            Ok(()) => Ok(true),
+            Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => {
+                self.writer = None;
+                Ok(false)
+            }
+            Err(error) => {
+                // Nothing more can be written; what was is complete to the last whole record.
+                self.writer = None;
+                Err(error).with_context(|| self.failure())
+            }
+        }
+    }
+
+    fn failure(&self) -> String {
+        format!(
+            "writing to '{}' failed, and what was captured before is in it; make room or choose another place",
+            self.name
+        )
+    }
+
+    /// Ends the file, and says what it could not carry.
+    fn finish(mut self) -> anyhow::Result<()> {
+        let Some(writer) = self.writer.take() else { return Ok(()) };
+        match writer.finish() {
+            Ok(left_out) => {
+                for (what, count) in left_out.iter() {
+                    eprintln!("cantap: the format of '{}' cannot carry {count} {what}", self.name);
+                }
+                Ok(())
+            }
+            Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => Ok(()),
+            Err(error) => Err(error).with_context(|| self.failure()),
+        }
+    }
+}

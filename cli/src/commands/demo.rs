@@ -1,0 +1,294 @@
+//! `cantap demo`: the worst traffic there is, without a board, and the check that nothing is lost silently.
+
+use std::io::{self, Read, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use cantap::device::{Link, Records};
+use cantap::formats::{Format, ReadOptions, TraceWriter, WriteOptions, create_writer, open_reader};
+use cantap::simbus::Frames;
+use cantap::virtual_device::{Options, SequenceCheck, start};
+use cantap::wire::CHANNELS;
+use cantap::{Channel, Device, TraceRecord};
+use indicatif::{ProgressBar, ProgressStyle};
+
+use crate::args;
+use crate::exit;
+use crate::interrupt;
+use crate::losses::Losses;
+use crate::meter::{Meter, rounded};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Both channels of a virtual device run at 1 Mbit/s in real time. By default they carry standard \
+                        frames without\ndata at 100 % load, 20833 frames/s each: more frames than any other traffic.\n\
+                        Exit code 0 means that every frame sent was received in order or counted lost.\n\n\
+                        Examples:\n  cantap demo\n  cantap demo --stall 400ms     the device's queue bridges it\n  \
+                        cantap demo --stall 3s        frames are lost, and every one is counted\n  \
+                        cantap demo --frames ext8 --load 80 --seconds 20 --json"
+)]
+pub struct Args {
+    /// How long to capture, in seconds or as 500ms, 2m.
+    #[arg(long, default_value = "5", value_parser = args::duration)]
+    seconds: Duration,
+    /// Bus load in per cent.
+    #[arg(long, default_value = "100", value_name = "PCT", value_parser = args::percent)]
+    load: f64,
+    /// Which frames: std0, std8, ext0, ext8, rtr or mix.
+    #[arg(long, default_value = "std0")]
+    frames: Frames,
+    /// The host stops reading for this time in mid-run.
+    #[arg(long, value_name = "TIME", value_parser = args::duration)]
+    stall: Option<Duration>,
+    /// Keep the captured trace in this file.
+    #[arg(short, long)]
+    output: Option<PathBuf>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+const BITRATE_BPS: u32 = 1_000_000;
+/// The capture goes on for so long before and after a stall, at least.
+const AROUND_STALL: Duration = Duration::from_secs(1);
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+
+#[derive(serde::Serialize)]
+struct ChannelSummary {
+    channel: u8,
+    sent: u64,
+    delivered: u64,
+    lost: u64,
+    frames_per_s: f64,
+    bus_load_pct: f64,
+}
+
+#[derive(serde::Serialize)]
+struct Summary {
+    seconds: f64,
+    channels: Vec<ChannelSummary>,
+    wire_bytes_per_frame: f64,
+    queue_bytes: u32,
+    queue_high_water_bytes: u32,
+    lost: Losses,
+    in_order: bool,
+    ok: bool,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    interrupt::watch()?;
+    let length = args.stall.map_or(args.seconds, |stall| args.seconds.max(stall + 2 * AROUND_STALL));
+    let options = Options { load_percent: args.load, frames: args.frames, ..Options::default() };
+    let connection = start(options.clone())?;
+    let witness = Arc::clone(&connection.witness);
+    let stall = Stall::default();
+    let reader = StallingReader { inner: connection.reader, stall: stall.clone() };
+    let link = Link::new(reader, connection.writer).keeping(connection.device);
+    let device = Device::over(link, "virtual")?;
+    let mut file = TraceFile::create(args.output.as_deref())?;
+
+    let bytes_before = device.counters().bytes;
+    for channel in Channel::ALL {
+        device.listen(channel, BITRATE_BPS)?;
+    }
+    let started = Instant::now();
+    if let Some(pause) = args.stall {
+        stall.plan(started + length.saturating_sub(pause) / 2, pause);
+    }
+    let mut books = Books::new(&options);
+    let mut records = device.records();
+    let bar = progress_bar(length, args.json);
+    while started.elapsed() < length && !interrupt::requested() {
+        if let Some(batch) = records.next_batch(LOOK_EVERY)? {
+            for record in &batch {
+                books.push(record);
+                file.writer.write(record).context("the trace cannot be written; make room on the disk")?;
+            }
+            records.recycle(batch);
+        }
+        bar.set_position(started.elapsed().as_millis() as u64);
+        bar.set_message(format!("{} frames", books.delivered()));
+    }
+    let status = device.stop()?;
+    drain(&mut records, &mut books, &mut file)?;
+    bar.finish_and_clear();
+
+    let counters = device.counters();
+    let kept = file.finish()?;
+    let heard = witness.heard().frames;
+    let received: u64 = counters.channels.iter().map(|channel| channel.received).sum();
+    let in_order = books.checks.iter().all(SequenceCheck::in_order);
+    let holds = books.checks.iter().zip(heard).all(|(check, sent)| check.holds(sent));
+    let summary = Summary {
+        seconds: rounded(books.meters.iter().map(Meter::seconds).fold(0.0, f64::max), 3),
+        channels: Channel::ALL.map(|channel| books.summarize(channel, heard)).into(),
+        wire_bytes_per_frame: rounded((counters.bytes - bytes_before) as f64 / received.max(1) as f64, 3),
+        queue_bytes: device.hello().queue_bytes,
+        queue_high_water_bytes: status.queue_high_water_bytes,
+        lost: Losses::of(&counters),
+        in_order,
+        ok: holds && kept.is_none_or(|kept| kept == books.delivered()),
+    };
+    report(args, &summary)?;
+    Ok(if summary.ok { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
+}
+
+/// What is kept of the records as they come.
+struct Books {
+    meters: [Meter; CHANNELS],
+    checks: [SequenceCheck; CHANNELS],
+}
+
+impl Books {
+    fn new(options: &Options) -> Self {
+        Self {
+            meters: [Meter::new(BITRATE_BPS), Meter::new(BITRATE_BPS)],
+            checks: [0, 1].map(|channel| SequenceCheck::new(options.source(channel))),
+        }
+    }
+
+    fn push(&mut self, record: &TraceRecord) {
+        let channel = usize::from(record.channel == 2);
+        self.meters[channel].push(record);
+        self.checks[channel].push(record);
+    }
+
+    fn delivered(&self) -> u64 {
+        self.checks.iter().map(SequenceCheck::delivered).sum()
+    }
+
+    fn summarize(&self, channel: Channel, heard: [u64; CHANNELS]) -> ChannelSummary {
+        let (meter, check) = (&self.meters[channel.index()], &self.checks[channel.index()]);
+        ChannelSummary {
+            channel: channel.number(),
+            sent: heard[channel.index()],
+            delivered: check.delivered(),
+            lost: check.lost(),
+            frames_per_s: rounded(meter.frames_per_s(), 1),
+            bus_load_pct: rounded(meter.bus_load_pct(), 2),
+        }
+    }
+}
+
+/// Takes what had been captured when the channels were closed.
+fn drain(records: &mut Records, books: &mut Books, file: &mut TraceFile) -> anyhow::Result<()> {
+    for record in records {
+        let record = record?;
+        books.push(&record);
+        file.writer.write(&record).context("the trace cannot be written; make room on the disk")?;
+    }
+    Ok(())
+}
+
+fn progress_bar(length: Duration, hidden: bool) -> ProgressBar {
+    if hidden {
+        return ProgressBar::hidden();
+    }
+    let bar = ProgressBar::new(length.as_millis() as u64);
+    let style = ProgressStyle::with_template("{bar:40} {percent:>3} %  {msg}");
+    style.map_or(bar.clone(), |style| bar.with_style(style))
+}
+
+fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
+    let mut out = io::stdout().lock();
+    if args.json {
+        writeln!(out, "{}", serde_json::to_string(summary)?)?;
+        return Ok(());
+    }
+    writeln!(
+        out,
+        "two channels at 1 Mbit/s, {} % load of {} frames, {} s",
+        args.load, args.frames, summary.seconds
+    )?;
+    for channel in &summary.channels {
+        let ChannelSummary { channel, sent, delivered, lost, frames_per_s, bus_load_pct } = channel;
+        writeln!(
+            out,
+            "channel {channel}: {sent} sent = {delivered} delivered + {lost} lost, {frames_per_s} frames/s, \
+             bus load {bus_load_pct} %"
+        )?;
+    }
+    writeln!(out, "on the wire: {} bytes per frame", summary.wire_bytes_per_frame)?;
+    writeln!(
+        out,
+        "device's queue: at most {} of {} bytes full",
+        summary.queue_high_water_bytes, summary.queue_bytes
+    )?;
+    writeln!(out, "lost: {}", summary.lost.line())?;
+    if let Some(path) = &args.output {
+        writeln!(out, "trace: {}", path.display())?;
+    }
+    let verdict = if summary.ok {
+        "every frame sent was received in order or counted lost"
+    } else {
+        "THE CHECK DID NOT HOLD: a frame is missing, out of order or not counted"
+    };
+    writeln!(out, "{verdict}")?;
+    Ok(())
+}
+
+/// The captured trace: where the user wants it, or in a temporary file that is read back and removed.
+struct TraceFile {
+    writer: Box<dyn TraceWriter>,
+    temporary: Option<tempfile::TempPath>,
+}
+
+impl TraceFile {
+    fn create(output: Option<&Path>) -> anyhow::Result<Self> {
+        let mut temporary = None;
+        if output.is_none() {
+            let file = tempfile::Builder::new().prefix("cantap-demo-").suffix(".log").tempfile();
+            temporary = Some(file.context("no temporary file; name one with -o")?.into_temp_path());
+        }
+        let path = output.or(temporary.as_deref()).unwrap_or(Path::new("-"));
+        let format = path.extension().is_none().then_some(Format::Candump);
+        let writer = create_writer(path, &WriteOptions { format, ..WriteOptions::default() })
+            .with_context(|| format!("cannot write to '{}'; choose another place with -o", path.display()))?;
+        Ok(Self { writer, temporary })
+    }
+
+    /// Ends the file. Returns how many frames it holds, if it is ours to read back.
+    fn finish(self) -> anyhow::Result<Option<u64>> {
+        self.writer.finish().context("the trace cannot be written; make room on the disk")?;
+        let Some(path) = self.temporary else { return Ok(None) };
+        let mut frames = 0;
+        for record in open_reader(&path, &ReadOptions::default())? {
+            frames += u64::from(record?.frame().is_some());
+        }
+        Ok(Some(frames))
+    }
+}
+
+/// A pause of the host's reading: from when, for how long.
+#[derive(Clone, Default)]
+struct Stall(Arc<OnceLock<(Instant, Duration)>>);
+
+impl Stall {
+    fn plan(&self, from: Instant, length: Duration) {
+        // It is planned once.
+        let _ = self.0.set((from, length));
+    }
+}
+
+/// Reads nothing during the stall.
+struct StallingReader<R> {
+    inner: R,
+    stall: Stall,
+}
+
+impl<R: Read> Read for StallingReader<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        if let Some((from, length)) = self.stall.0.get() {
+            let since = Instant::now().saturating_duration_since(*from);
+            if !since.is_zero() && since < *length {
+                std::thread::sleep(length.saturating_sub(since));
+            }
+        }
+        self.inner.read(out)
+    }
+}

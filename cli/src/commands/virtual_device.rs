@@ -1,0 +1,44 @@
+//! `cantap virtual`: the virtual device as a serial port for any program.
+
+use std::io::Write;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use cantap::virtual_device::{Options, open_terminal};
+
+use crate::interrupt;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Options, separated by commas:\n  load=PCT         bus load, 0 to 100 (50)\n  \
+                        frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
+                        bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
+                        burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
+                        errors=PCT       share of the frames that are destroyed (0)\n  \
+                        ack=yes|no       whether simulated nodes acknowledge (yes)\n  \
+                        wire=apart|joined  a bus for each channel, or one for both (apart)\n  \
+                        channels=1|2|both  which buses have traffic (both)\n  \
+                        seed=N           another sequence of frames (1)\n  \
+                        pace=real|fast   real time, or as fast as the host reads (real)\n  \
+                        log=FILE         replay a trace file at its own times; must come last\n\n\
+                        The same options follow `virtual:` wherever a device is asked for.\n\n\
+                        Examples:\n  cantap virtual load=100,frames=std0\n  cantap virtual bitrate=250k,log=drive.log")]
+pub struct Args {
+    /// What happens on the simulated buses.
+    #[arg(default_value = "")]
+    options: Options,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    interrupt::watch()?;
+    let terminal = open_terminal(args.options.clone())?;
+    let mut out = std::io::stdout().lock();
+    writeln!(out, "{}", terminal.path())?;
+    out.flush()?;
+    eprintln!("cantap: the virtual device is at {}; Ctrl-C ends it", terminal.path());
+    while !interrupt::requested() {
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Ok(ExitCode::SUCCESS)
+}

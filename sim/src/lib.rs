@@ -10,6 +10,7 @@ pub mod can;
 pub mod capture;
 pub mod cpu;
 pub mod elf;
+pub mod link;
 pub mod machine;
 pub mod memory_map;
 pub mod otg;
@@ -18,6 +19,7 @@ pub mod probe;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;
+pub mod run;
 pub mod soc;
 pub mod stop;
 pub mod trace;

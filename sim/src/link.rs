@@ -1,0 +1,273 @@
+//! The emulated device as somebody else's serial port: behind a pseudo-terminal, or behind a reader and a
+//! writer in this process.
+//!
+//! Emulated time follows the clock on the wall and never runs ahead of it; under full load it falls
+//! behind. What happens when the client does not read is [`Pace`]'s question.
+
+use std::collections::VecDeque;
+use std::io::{self, Read, Write};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TryRecvError, TrySendError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use crate::CYCLES_PER_SECOND;
+use crate::elf::Image;
+use crate::machine::Setup;
+use crate::rig::{MS, Rig, RigError};
+use crate::run::Options;
+
+/// What happens while the client does not read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Pace {
+    /// Time stands still: the client sets the pace, and nothing is lost through its fault.
+    Client,
+    /// Time goes on, and the device's queue fills.
+    RealTime,
+}
+
+/// Pieces that wait for a reader in this process; each is what the device sent in a millisecond.
+const PIECES: usize = 64;
+/// A read without bytes returns after this time.
+const READ_WAIT: Duration = Duration::from_millis(50);
+/// So long to wait before a client that lags is looked at again.
+const LAG_WAIT: Duration = Duration::from_micros(500);
+/// So far the emulation may lag behind the wall's clock before it gives the difference up.
+const MOST_BEHIND: Duration = Duration::from_millis(100);
+
+/// A client's end of the byte stream. Neither direction waits.
+pub trait Client {
+    /// What the client wrote since the last time. An error means that it is gone.
+    fn receive(&self) -> io::Result<Vec<u8>>;
+    /// Takes as many of the bytes as it can and says how many.
+    fn deliver(&self, bytes: &[u8]) -> io::Result<usize>;
+}
+
+#[cfg(unix)]
+impl Client for crate::pty::Pty {
+    fn receive(&self) -> io::Result<Vec<u8>> {
+        self.read()
+    }
+
+    fn deliver(&self, bytes: &[u8]) -> io::Result<usize> {
+        self.write(bytes)
+    }
+}
+
+/// An emulated device with its port open, and traffic on its buses.
+pub struct Served {
+    rig: Rig,
+    pace: Pace,
+    waiting: VecDeque<u8>,
+}
+
+impl Served {
+    /// Boots the firmware, enumerates the device and opens its port. Traffic of `options` runs from then on without
+    /// end, or as long as what is replayed.
+    pub fn start(image: Image, options: &Options, pace: Pace) -> Result<Self, RigError> {
+        let mut rig = Rig::new(image, Setup::default(), options.timing);
+        rig.plug_in()?;
+        let from = rig.now();
+        crate::run::add_traffic(&mut rig, options, from, u64::MAX);
+        Ok(Self { rig, pace, waiting: VecDeque::new() })
+    }
+
+    /// Serves a client until `seconds` of emulated time are over, or without end.
+    pub fn until(&mut self, seconds: Option<Duration>, client: &impl Client) -> Result<(), ServeError> {
+        let cycles = seconds.map(|seconds| (seconds.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64);
+        let end = cycles.map_or(u64::MAX, |cycles| self.rig.now().saturating_add(cycles));
+        let mut due = Instant::now();
+        while self.rig.now() < end {
+            self.hand_over(client)?;
+            let lags = !self.waiting.is_empty();
+            if lags && self.pace == Pace::Client {
+                std::thread::sleep(LAG_WAIT);
+                due = Instant::now();
+                continue;
+            }
+            self.millisecond(!lags)?;
+            due += Duration::from_millis(1);
+            let now = Instant::now();
+            match due.checked_duration_since(now) {
+                Some(ahead) => {
+                    self.hand_over(client)?;
+                    std::thread::sleep(ahead);
+                }
+                None if now - due > MOST_BEHIND => due = now,
+                None => {}
+            }
+        }
+        Ok(self.hand_over(client)?)
+    }
+
+    /// One emulated millisecond. A port that is not read is left alone by the host's driver.
+    fn millisecond(&mut self, reading: bool) -> Result<(), RigError> {
+        self.rig.with_host(|host, _| host.read(reading));
+        let bytes = self.rig.run_unbooked(MS)?;
+        self.waiting.extend(bytes);
+        // The client cannot see a device that comes back by itself after a reset: its port stays.
+        self.rig.with_host(|host, _| host.open_port());
+        Ok(())
+    }
+
+    /// Moves bytes in both directions.
+    fn hand_over(&mut self, client: &impl Client) -> io::Result<()> {
+        let bytes = client.receive()?;
+        if !bytes.is_empty() {
+            self.rig.with_host(|host, _| host.send(&bytes));
+        }
+        while !self.waiting.is_empty() {
+            let (piece, _) = self.waiting.as_slices();
+            let taken = client.deliver(piece)?;
+            if taken == 0 {
+                break;
+            }
+            self.waiting.drain(..taken);
+        }
+        Ok(())
+    }
+}
+
+/// Why serving ended.
+#[derive(Debug, thiserror::Error)]
+pub enum ServeError {
+    /// The board.
+    #[error("{0}")]
+    Rig(#[from] RigError),
+    /// The client's end.
+    #[error("the client is gone: {0}")]
+    Client(#[from] io::Error),
+}
+
+/// The ends that a thread of the emulation talks to.
+struct Channels {
+    to_client: SyncSender<Vec<u8>>,
+    from_client: Receiver<Vec<u8>>,
+    stop: Arc<AtomicBool>,
+}
+
+impl Client for Channels {
+    fn receive(&self) -> io::Result<Vec<u8>> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(io::ErrorKind::BrokenPipe.into());
+        }
+        match self.from_client.try_recv() {
+            Ok(bytes) => Ok(bytes),
+            // A writer that is gone says nothing more; the reader may still want to hear.
+            Err(TryRecvError::Empty | TryRecvError::Disconnected) => Ok(Vec::new()),
+        }
+    }
+
+    fn deliver(&self, bytes: &[u8]) -> io::Result<usize> {
+        match self.to_client.try_send(bytes.to_vec()) {
+            Ok(()) => Ok(bytes.len()),
+            Err(TrySendError::Full(_)) => Ok(0),
+            Err(TrySendError::Disconnected(_)) => Err(io::ErrorKind::BrokenPipe.into()),
+        }
+    }
+}
+
+/// An emulated device in a thread of its own, as two halves of a byte stream.
+pub struct EmulatedPort {
+    /// From the device. Without bytes it returns [`io::ErrorKind::TimedOut`] after a moment; no bytes (`Ok(0)`) mean
+    /// that the emulation has ended.
+    pub reader: PortReader,
+    /// To the device.
+    pub writer: PortWriter,
+    /// Ends the emulation when it is dropped.
+    pub device: EmulatedDevice,
+}
+
+impl EmulatedPort {
+    /// Boots `image` and opens its port; returns when a host would see it.
+    pub fn start(image: Image, options: Options, pace: Pace) -> Result<Self, ServeError> {
+        let (to_client, from_device) = sync_channel(PIECES);
+        let (to_device, from_client) = sync_channel(PIECES);
+        let (started, ready) = sync_channel(1);
+        let stop = Arc::new(AtomicBool::new(false));
+        let end = Arc::new(Mutex::new(None));
+        let channels = Channels { to_client, from_client, stop: Arc::clone(&stop) };
+        let last_words = Arc::clone(&end);
+        let thread = std::thread::Builder::new().name("cantap-emulation".to_owned()).spawn(move || {
+            let mut served = match Served::start(image, &options, pace) {
+                Ok(served) => served,
+                Err(error) => {
+                    let _ = started.send(Err(error));
+                    return;
+                }
+            };
+            let _ = started.send(Ok(()));
+            if let Err(ServeError::Rig(error)) = served.until(None, &channels) {
+                *last_words.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
+            }
+        })?;
+        let device = EmulatedDevice { stop, thread: Some(thread) };
+        // The thread ends only after it has said one or the other.
+        ready.recv().map_err(|_| io::Error::other("the emulation ended before it began"))??;
+        Ok(Self {
+            reader: PortReader { pieces: from_device, rest: VecDeque::new(), end },
+            writer: PortWriter(to_device),
+            device,
+        })
+    }
+}
+
+/// See [`EmulatedPort::reader`].
+pub struct PortReader {
+    pieces: Receiver<Vec<u8>>,
+    rest: VecDeque<u8>,
+    end: Arc<Mutex<Option<String>>>,
+}
+
+impl Read for PortReader {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        if self.rest.is_empty() {
+            match self.pieces.recv_timeout(READ_WAIT) {
+                Ok(piece) => self.rest = piece.into(),
+                Err(RecvTimeoutError::Timeout) => return Err(io::ErrorKind::TimedOut.into()),
+                Err(RecvTimeoutError::Disconnected) => {
+                    let end = self.end.lock().unwrap_or_else(PoisonError::into_inner).take();
+                    return end.map_or(Ok(0), |words| Err(io::Error::other(words)));
+                }
+            }
+        }
+        self.rest.read(out)
+    }
+}
+
+/// See [`EmulatedPort::writer`].
+pub struct PortWriter(SyncSender<Vec<u8>>);
+
+impl Write for PortWriter {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self.0.try_send(bytes.to_vec()) {
+            Ok(()) => Ok(bytes.len()),
+            Err(TrySendError::Full(_)) => {
+                std::thread::sleep(LAG_WAIT);
+                Err(io::ErrorKind::Interrupted.into())
+            }
+            Err(TrySendError::Disconnected(_)) => Err(io::ErrorKind::BrokenPipe.into()),
+        }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// See [`EmulatedPort::device`].
+pub struct EmulatedDevice {
+    stop: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Drop for EmulatedDevice {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            // A thread that panicked has said so.
+            let _ = thread.join();
+        }
+    }
+}

@@ -1,0 +1,324 @@
+//! One run of the command: traffic on the buses, a capture over USB, and the figures. Everything in it
+//! depends on the options only, except how long it took.
+
+use std::time::{Duration, Instant};
+
+use cantap_wire::{CHANNELS, Channel, Frame};
+use serde_json::{Value, json};
+
+use crate::bus::bits::bus_bits;
+use crate::capture::{Losses, Stamps};
+use crate::elf::Image;
+use crate::machine::{Machine, Setup};
+use crate::rig::{MS, Rig, RigError};
+use crate::soc::CAN_IRQS;
+use crate::trace::Trace;
+use crate::traffic::{Kind, Script, Traffic};
+use crate::usb_host::Timing;
+use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+
+/// The first 16 exceptions are the core's own.
+const FIRST_INTERRUPT: u16 = 16;
+/// The device may take so long to empty its queue when the traffic has ended.
+const DRAIN: u64 = 5 * CYCLES_PER_SECOND;
+/// Quiet time before the traffic begins and after it ends.
+const MARGIN: u64 = 2 * MS;
+
+/// What is on the buses.
+#[derive(Clone, Debug)]
+pub enum Load {
+    /// Seeded frames of a kind, at a load in per cent.
+    Frames {
+        /// Which.
+        kind: Kind,
+        /// 0 to 100; 100 is back to back.
+        percent: f64,
+    },
+    /// Recorded frames for each channel, at times in core cycles after the first.
+    Replay([Vec<(u64, Frame)>; CHANNELS]),
+}
+
+/// How to run.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Emulated seconds of traffic.
+    pub seconds: f64,
+    /// The traffic.
+    pub load: Load,
+    /// Channels that are captured and carry traffic.
+    pub channels: Vec<Channel>,
+    /// Bit rate of both buses, in bit/s.
+    pub bitrate_bps: u32,
+    /// The host stops reading for so long, in the middle of the run.
+    pub stall: Option<Duration>,
+    /// Seed of the traffic.
+    pub seed: u64,
+    /// How the USB host keeps time.
+    pub timing: Timing,
+    /// Whether to record a picture of the run.
+    pub trace: bool,
+}
+
+impl Default for Options {
+    /// One second of the worst traffic on both channels.
+    fn default() -> Self {
+        Self {
+            seconds: 1.0,
+            load: Load::Frames { kind: Kind::Std0, percent: 100.0 },
+            channels: Channel::ALL.to_vec(),
+            bitrate_bps: 1_000_000,
+            stall: None,
+            seed: 1,
+            timing: Timing::default(),
+            trace: false,
+        }
+    }
+}
+
+/// One channel's figures.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ChannelReport {
+    /// Which.
+    pub channel: Channel,
+    /// Frames on the bus while the channel was open.
+    pub sent: u64,
+    /// Frames that the host received.
+    pub delivered: u64,
+    /// Frames counted lost, by stage.
+    pub lost: Losses,
+    /// Frames per second on the bus.
+    pub frames_per_s: f64,
+    /// Bus load in per cent, from exact frame lengths.
+    pub bus_load_pct: f64,
+}
+
+/// What a run showed.
+#[derive(Debug)]
+pub struct Report {
+    /// Emulated seconds of traffic.
+    pub seconds: f64,
+    /// Each captured channel.
+    pub channels: Vec<ChannelReport>,
+    /// Bytes over USB per frame delivered, everything included.
+    pub wire_bytes_per_frame: f64,
+    /// Size of the device's record queue.
+    pub queue_bytes: u32,
+    /// Most bytes that were in it.
+    pub queue_high_water_bytes: u32,
+    /// How late stamps were.
+    pub stamps: Stamps,
+    /// The longest time in which the interrupt that stamps was masked, in nanoseconds.
+    pub masked_ns_max: f64,
+    /// Share of the traffic's time in which the core was not asleep.
+    pub cpu_load_pct: f64,
+    /// Cycles in the receive interrupts per frame.
+    pub isr_cycles_per_frame: f64,
+    /// Seconds that the emulation took per emulated second of traffic.
+    pub host_s_per_emulated_s: f64,
+    /// Share of the traffic's time for each exception that ran: name, entries, per cent.
+    pub tasks: Vec<(String, u64, f64)>,
+    /// What broke the law of counting.
+    pub faults: Vec<String>,
+    /// Whether every frame was delivered in order and bit for bit, or counted lost where it is missing.
+    pub ok: bool,
+}
+
+/// Runs `image` and captures from it.
+pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, Trace)>), RigError> {
+    let mut rig = Rig::new(image, Setup::default(), options.timing);
+    let hello = rig.connect()?;
+    for channel in &options.channels {
+        rig.listen(*channel, options.bitrate_bps)?;
+    }
+    let from = rig.now() + MARGIN;
+    let length = (options.seconds * CYCLES_PER_SECOND as f64) as u64;
+    add_traffic(&mut rig, options, from, from + length);
+    rig.run_for(from - rig.now())?;
+
+    let bytes_before = rig.session.bytes();
+    rig.machine.reset_probe();
+    if options.trace {
+        rig.machine.start_trace();
+    }
+    let wall = Instant::now();
+    if let Some(stall) = options.stall {
+        let stall = (stall.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64;
+        rig.run_for(length.saturating_sub(stall) / 2)?;
+        rig.with_host(|host, _| host.read(false));
+        rig.run_for(stall)?;
+        rig.with_host(|host, _| host.read(true));
+    }
+    rig.run_for((from + length).saturating_sub(rig.now()))?;
+    let took = wall.elapsed().as_secs_f64();
+    let span = rig.now() - from;
+    let costs = Costs::of(&rig.machine, span);
+    let trace = rig.machine.take_trace();
+
+    // A frame that began before the end of the traffic ends after it.
+    rig.run_for(MARGIN)?;
+    let drained = rig.drain(DRAIN)?;
+    let bytes = rig.session.bytes() - bytes_before;
+    let status = rig.status()?;
+    for channel in &options.channels {
+        rig.close(*channel)?;
+    }
+    let seconds = span as f64 / CYCLES_PER_SECOND as f64;
+    let delivered: u64 = options.channels.iter().map(|channel| rig.ledger.delivered_count(*channel)).sum();
+    let mut faults = rig.ledger.faults().to_vec();
+    faults.extend(rig.session.corruptions().iter().map(|corruption| format!("on USB: {corruption:?}")));
+    if !drained {
+        faults.push("the device did not come to an end of what it had to say".to_owned());
+    }
+    let report = Report {
+        seconds,
+        channels: options
+            .channels
+            .iter()
+            .map(|channel| channel_report(&rig, *channel, seconds, options))
+            .collect(),
+        wire_bytes_per_frame: bytes as f64 / delivered.max(1) as f64,
+        queue_bytes: hello.queue_bytes,
+        queue_high_water_bytes: status.queue_high_water_bytes,
+        stamps: rig.ledger.stamps(),
+        masked_ns_max: costs.masked_ns,
+        cpu_load_pct: costs.load_pct,
+        isr_cycles_per_frame: costs.capture_cycles as f64 / delivered.max(1) as f64,
+        host_s_per_emulated_s: took / seconds,
+        tasks: costs.tasks,
+        ok: faults.is_empty() && rig.ledger.holds(),
+        faults,
+    };
+    Ok((report, trace.map(|trace| (rig.machine, trace))))
+}
+
+/// Puts the traffic of `options` on the buses, from core cycle `from` to `until`.
+pub(crate) fn add_traffic(rig: &mut Rig, options: &Options, from: u64, until: u64) {
+    for channel in &options.channels {
+        let n = channel.index();
+        match &options.load {
+            Load::Frames { kind, percent } => {
+                // Two channels of one seed must not carry the same frames.
+                let seed = options.seed.wrapping_mul(CHANNELS as u64).wrapping_add(n as u64);
+                let traffic = Traffic::new(*kind, seed, *percent, from, until);
+                rig.add_traffic(*channel, options.bitrate_bps, traffic);
+            }
+            Load::Replay(logs) => {
+                let frames = logs[n].iter().map(|(at, frame)| (from + at, *frame));
+                let frames = frames.filter(|(at, _)| *at < until).collect();
+                rig.add_traffic(*channel, options.bitrate_bps, Script::new(frames));
+            }
+        }
+    }
+}
+
+fn channel_report(rig: &Rig, channel: Channel, seconds: f64, options: &Options) -> ChannelReport {
+    let sent = rig.ledger.on_bus_count(channel);
+    let bits = rig.bus_bits(channel) as f64;
+    ChannelReport {
+        channel,
+        sent,
+        delivered: rig.ledger.delivered_count(channel),
+        lost: rig.ledger.losses(channel),
+        frames_per_s: sent as f64 / seconds,
+        bus_load_pct: 100.0 * bits / (seconds * f64::from(options.bitrate_bps)),
+    }
+}
+
+/// What the firmware's work cost while there was traffic.
+struct Costs {
+    masked_ns: f64,
+    load_pct: f64,
+    capture_cycles: u64,
+    tasks: Vec<(String, u64, f64)>,
+}
+
+impl Costs {
+    fn of(machine: &Machine, span: u64) -> Self {
+        let probe = machine.probe();
+        let receive_lines = CAN_IRQS.iter().flat_map(|irqs| &irqs[1..3]);
+        let tasks = (0..crate::probe::EXCEPTIONS as u16)
+            .filter(|number| probe.entries(*number) > 0)
+            .map(|number| {
+                let share = 100.0 * probe.cycles(number) as f64 / span as f64;
+                (machine.exception_name(number), probe.entries(number), share)
+            })
+            .collect();
+        Self {
+            masked_ns: probe.longest_masked().cycles as f64 * 1000.0 / CYCLES_PER_US as f64,
+            load_pct: probe.load_percent(machine.now()),
+            capture_cycles: receive_lines.map(|irq| probe.cycles(FIRST_INTERRUPT + irq)).sum(),
+            tasks,
+        }
+    }
+}
+
+impl Report {
+    /// One object for scripts: the demo's keys, and the emulator's own.
+    pub fn to_json(&self) -> Value {
+        let channels: Vec<Value> = self
+            .channels
+            .iter()
+            .map(|channel| {
+                json!({
+                    "channel": channel.channel.number(),
+                    "sent": channel.sent,
+                    "delivered": channel.delivered,
+                    "lost": channel.lost.total(),
+                    "frames_per_s": rounded(channel.frames_per_s, 1),
+                    "bus_load_pct": rounded(channel.bus_load_pct, 2),
+                })
+            })
+            .collect();
+        let lost = |stage: fn(&Losses) -> u64| self.channels.iter().map(|one| stage(&one.lost)).sum::<u64>();
+        json!({
+            "seconds": rounded(self.seconds, 3),
+            "channels": channels,
+            "wire_bytes_per_frame": rounded(self.wire_bytes_per_frame, 3),
+            "queue_bytes": self.queue_bytes,
+            "queue_high_water_bytes": self.queue_high_water_bytes,
+            "lost": {
+                "controller": lost(|one| one.controller),
+                "queue": lost(|one| one.queue),
+                "link": lost(|one| one.link),
+                // The emulator's host never drops what it received.
+                "host": 0,
+            },
+            "in_order": self.faults.is_empty(),
+            "ok": self.ok,
+            "stamp_latency_ns": {
+                "min": self.stamps.min,
+                "median": self.stamps.median,
+                "max": self.stamps.max,
+            },
+            "masked_ns_max": rounded(self.masked_ns_max, 0),
+            "cpu_load_pct": rounded(self.cpu_load_pct, 1),
+            "isr_cycles_per_frame": rounded(self.isr_cycles_per_frame, 1),
+            "host_s_per_emulated_s": rounded(self.host_s_per_emulated_s, 2),
+        })
+    }
+}
+
+fn rounded(value: f64, digits: i32) -> f64 {
+    let factor = 10f64.powi(digits);
+    (value * factor).round() / factor
+}
+
+/// Recorded frames for each channel: a log's first interface is channel 1, its second channel 2, further ones are
+/// left out. Also the length of the log in cycles, its last frame included.
+pub fn replay(lines: Vec<(u64, String, Frame)>, bitrate_bps: u32) -> (Load, u64) {
+    let mut interfaces: Vec<String> = Vec::new();
+    let mut channels: [Vec<(u64, Frame)>; CHANNELS] = Default::default();
+    let mut length = 0;
+    for (at, interface, frame) in lines {
+        let n = interfaces.iter().position(|known| *known == interface).unwrap_or_else(|| {
+            interfaces.push(interface);
+            interfaces.len() - 1
+        });
+        if let Some(channel) = channels.get_mut(n) {
+            let bits = u64::from(bus_bits(&frame));
+            length = length.max(at + bits * CYCLES_PER_SECOND / u64::from(bitrate_bps) + MS);
+            channel.push((at, frame));
+        }
+    }
+    (Load::Replay(channels), length)
+}

@@ -168,6 +168,13 @@ impl Board {
         self.odd.iter().map(access).collect()
     }
 
+    /// Holds both buses dominant, or lets go of them.
+    pub fn hold_buses_dominant(&mut self, hold: bool) {
+        for wire in &mut self.wires {
+            wire.hold_dominant(hold, &mut self.can);
+        }
+    }
+
     /// Core cycles for which the core must stand still now.
     pub fn take_stall(&mut self) -> u64 {
         self.flash.take_stall()

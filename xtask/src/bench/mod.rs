@@ -4,6 +4,8 @@
 //! need. One file per subject; each has `run()`, which prints its own table.
 
 #[cfg(feature = "bench")]
+mod signals;
+#[cfg(feature = "bench")]
 mod wire;
 
 use anyhow::Result;
@@ -15,6 +17,8 @@ use xshell::cmd;
 enum Subject {
     /// Bytes per frame on the wire, and the encoder's cost.
     Wire,
+    /// Decoding signals, against cantools.
+    Signals,
 }
 
 /// What `cargo xtask bench` takes.
@@ -47,6 +51,7 @@ pub fn run(args: &Args) -> Result<()> {
     for subject in subjects {
         match subject {
             Subject::Wire => wire::run()?,
+            Subject::Signals => signals::run()?,
         }
     }
     Ok(())

@@ -4,6 +4,8 @@
 //! need. One file per subject; each has `run()`, which prints its own table.
 
 #[cfg(feature = "bench")]
+mod emulated;
+#[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
 mod wire;
@@ -19,6 +21,8 @@ enum Subject {
     Wire,
     /// Decoding signals, against cantools.
     Signals,
+    /// What the firmware's ELF costs and bears on the emulated board.
+    Emulated,
 }
 
 /// What `cargo xtask bench` takes.
@@ -52,6 +56,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Signals => signals::run()?,
+            Subject::Emulated => emulated::run()?,
         }
     }
     Ok(())

@@ -1,12 +1,14 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
 
 mod args;
+mod channel_args;
 mod commands;
 mod databases;
 mod input;
 mod interrupt;
 mod losses;
 mod meter;
+mod sending;
 mod timing_args;
 
 use std::process::ExitCode;

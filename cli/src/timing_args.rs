@@ -47,7 +47,6 @@ impl Wishes {
 
 impl TimingArgs {
     /// What was asked for, if anything was.
-    #[allow(dead_code, reason = "the first commands that open a channel are on their way")]
     pub fn request(&self) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
         if let Some(timing) = self.segments.or(self.btr) {

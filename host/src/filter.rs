@@ -12,29 +12,29 @@ use cantap_wire::Frame;
 
 use crate::{TraceEvent, TraceRecord};
 
-const EXTENDED: u32 = 1 << 31;
-const REMOTE: u32 = 1 << 30;
+pub(crate) const EXTENDED: u32 = 1 << 31;
+pub(crate) const REMOTE: u32 = 1 << 30;
 /// The kernel keeps bit 29 for itself: it marks inverse filters and error frames.
 const RESERVED: u32 = 1 << 29;
-const STANDARD_BITS: u32 = 0x7FF;
+pub(crate) const STANDARD_BITS: u32 = 0x7FF;
 
 /// One `ID:MASK` or `ID~MASK`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
-struct IdFilter {
-    id: u32,
-    mask: u32,
-    inverse: bool,
+pub(crate) struct IdFilter {
+    pub(crate) id: u32,
+    pub(crate) mask: u32,
+    pub(crate) inverse: bool,
 }
 
 /// Which records to accept, by channel, ID and kind of error.
 #[derive(Clone, Debug, Default, PartialEq, Eq, Hash)]
 pub struct Filter {
     /// The channel from 1; any if `None`.
-    channel: Option<u8>,
-    ids: Vec<IdFilter>,
+    pub(crate) channel: Option<u8>,
+    pub(crate) ids: Vec<IdFilter>,
     /// SocketCAN error classes to accept; `None` if the filter does not speak of errors.
     errors: Option<u32>,
-    join: bool,
+    pub(crate) join: bool,
 }
 
 /// Why a text is no filter.
@@ -52,14 +52,17 @@ pub enum ParseFilterError {
 }
 
 impl IdFilter {
-    fn accepts(&self, id: u32) -> bool {
-        // As the kernel does: a standard ID compared with its format has no bits above the eleventh.
-        let mask = if self.mask & EXTENDED != 0 && self.id & EXTENDED == 0 {
+    /// The mask as the kernel takes it: a standard ID compared with its format has no bits above the eleventh.
+    pub(crate) const fn effective_mask(&self) -> u32 {
+        if self.mask & EXTENDED != 0 && self.id & EXTENDED == 0 {
             self.mask & (STANDARD_BITS | EXTENDED | REMOTE)
         } else {
             self.mask
-        };
-        ((id ^ self.id) & mask == 0) != self.inverse
+        }
+    }
+
+    fn accepts(&self, id: u32) -> bool {
+        ((id ^ self.id) & self.effective_mask() == 0) != self.inverse
     }
 }
 

@@ -10,6 +10,7 @@ pub mod diff;
 pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
+pub mod hw_filter;
 pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;
@@ -25,6 +26,7 @@ pub mod stats;
 #[cfg(test)]
 mod testing;
 pub mod trace;
+pub mod transmit;
 #[cfg(feature = "signals")]
 pub mod trigger;
 #[cfg(feature = "virtual")]

@@ -3,6 +3,7 @@
 pub mod bits;
 pub mod capture;
 pub mod completions;
+pub mod care;
 pub mod decode;
 pub mod demo;
 pub mod diff;
@@ -10,7 +11,9 @@ pub mod info;
 pub mod list;
 pub mod plot;
 pub mod search;
+pub mod send;
 pub mod stats;
+pub mod status;
 pub mod timing;
 #[cfg(unix)]
 pub mod virtual_device;
@@ -47,6 +50,18 @@ pub enum Command {
     /// Run a virtual device behind a pseudo terminal.
     #[cfg(unix)]
     Virtual(virtual_device::Args),
+    /// Show a device's state: counters, errors, queue, temperature, registers.
+    Status(status::Args),
+    /// Send frames: now, periodically, or in reply.
+    Send(Box<send::Args>),
+    /// Blink a device's LEDs, to find it among others.
+    Identify(care::Identify),
+    /// Restart a device's firmware.
+    Reset(care::Reset),
+    /// Bring a device into its USB bootloader and write a firmware.
+    Update(care::Update),
+    /// Keep a configuration on the device over a power cycle, or erase it.
+    Defaults(Box<care::Defaults>),
 }
 
 impl Command {
@@ -67,6 +82,12 @@ impl Command {
             Self::List(args) => list::run(&args),
             #[cfg(unix)]
             Self::Virtual(args) => virtual_device::run(&args),
+            Self::Status(args) => status::run(&args),
+            Self::Send(args) => send::run(&args),
+            Self::Identify(args) => care::identify(&args),
+            Self::Reset(args) => care::reset(&args),
+            Self::Update(args) => care::update(&args),
+            Self::Defaults(args) => care::defaults(&args),
         }
     }
 }

@@ -177,7 +177,7 @@ fn sentence(refusal: Refusal) -> String {
         Refusal::BadSlot => "it has no such table entry; `cantap info` shows how many there are",
         Refusal::ChannelOpen => "the channel is open; close it first",
         Refusal::ChannelClosed => "the channel is closed; open it first",
-        Refusal::ListenOnly => "the channel only listens; open it in normal mode to send",
+        Refusal::ListenOnly => "the channel only listens; open it in normal mode (--mode normal) to send",
         Refusal::WouldDisturb => "that would disturb the other channel; close that one first",
         Refusal::TooFarAhead => "the target time is too far ahead; send it later",
         Refusal::Hardware => {

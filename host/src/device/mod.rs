@@ -121,22 +121,18 @@ impl Device {
         self.request_within(command, REQUEST_TIMEOUT)
     }
 
-    fn request_within(&self, command: Command, timeout: Duration) -> Result<Reply, DeviceError> {
+    /// Sends any request without waiting for its answer, so that several can be under way: a device handles them
+    /// in order. A few at a time; their bytes wait in the device's input.
+    pub fn request_later(&self, command: Command) -> Result<Pending<'_>, DeviceError> {
         if let Some(gone) = self.shared.gone() {
             return Err(gone);
         }
         let (id, answers) = self.shared.ask(command)?;
-        match answers.recv_timeout(timeout) {
-            Ok(Answer::Response(response)) => response.result.map_err(|refusal| match refusal {
-                Refusal::Protocol { device } => DeviceError::Protocol { device },
-                refusal => DeviceError::Refused { refusal },
-            }),
-            Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
-            Err(_) => {
-                self.shared.forget(id);
-                Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))
-            }
-        }
+        Ok(Pending { shared: &self.shared, id, answers })
+    }
+
+    fn request_within(&self, command: Command, timeout: Duration) -> Result<Reply, DeviceError> {
+        self.request_later(command)?.wait_within(timeout)
     }
 
     fn order(&self, order: Order) {
@@ -397,6 +393,40 @@ fn no_hello() -> Hello {
         trigger_slots: 0,
         filter_banks: 0,
         capabilities: 0,
+    }
+}
+
+/// A request under way. Dropping it ignores the answer.
+#[must_use = "the answer may be a refusal"]
+pub struct Pending<'d> {
+    shared: &'d Shared,
+    id: u16,
+    answers: Receiver<Answer>,
+}
+
+impl Pending<'_> {
+    /// Waits for the answer.
+    pub fn wait(self) -> Result<Reply, DeviceError> {
+        self.wait_within(REQUEST_TIMEOUT)
+    }
+
+    fn wait_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
+        match self.answers.recv_timeout(timeout) {
+            Ok(Answer::Response(response)) => response.result.map_err(|refusal| match refusal {
+                Refusal::Protocol { device } => DeviceError::Protocol { device },
+                refusal => DeviceError::Refused { refusal },
+            }),
+            Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
+            Err(_) => {
+                Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))
+            }
+        }
+    }
+}
+
+impl Drop for Pending<'_> {
+    fn drop(&mut self) {
+        self.shared.forget(self.id);
     }
 }
 

@@ -1,0 +1,234 @@
+//! `cantap send`: frames now, periodically, or as replies.
+
+mod modifiers;
+
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, bail};
+use cantap::filter::Filter;
+use cantap::transmit::Stream;
+use cantap::wire::message::{
+    DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, TRIGGER_TAG, Trigger,
+};
+use cantap::{Address, Channel, Device, Frame, Id, hw_filter, signals};
+
+use crate::channel_args::{self, ChannelArgs};
+use crate::databases::DatabaseArgs;
+use crate::sending::{self, GIVE_UP_AFTER, Tally};
+use crate::{args, interrupt};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Frames are written as 123#DEADBEEF, 5A1#11.22.33, 123#R3, 1F334455#1122, or as \
+                  Message:Signal=value,Signal=value with --db.\nEach frame that was sent is printed with the time at \
+                  which it ended on the bus.\n\nExamples:\n  cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
+                  cantap send -d virtual can1 123#00 --period 10ms --count 100 --counter 0\n  \
+                  cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
+                  cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
+pub struct Args {
+    /// Where the device is: a serial port, or virtual.
+    #[arg(short, long)]
+    device: Address,
+    /// can0 or 1, can1 or 2.
+    #[arg(value_parser = channel_args::channel)]
+    channel: Channel,
+    /// The frames, in this order.
+    #[arg(required = true, value_name = "FRAME")]
+    frames: Vec<String>,
+    #[command(flatten)]
+    open: ChannelArgs,
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// Send again and again, by the device's own timer, at least 47us apart.
+    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    period: Option<Duration>,
+    /// How many times each frame is sent. Without --period and --on-rx they follow one another at once.
+    #[arg(short = 'n', long, value_parser = clap::value_parser!(u32).range(1..))]
+    count: Option<u32>,
+    /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump.
+    #[arg(long, value_name = "FILTER", conflicts_with = "period")]
+    on_rx: Option<String>,
+    /// Send as the answer to remote frames of the same ID.
+    #[arg(long, conflicts_with_all = ["period", "on_rx"])]
+    reply: bool,
+    /// End after this time. Without it and --count, periodic frames and replies go on until Ctrl-C.
+    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    time: Option<Duration>,
+    #[command(flatten)]
+    modifiers: modifiers::ModifierArgs,
+    /// Print nothing about frames that were sent.
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// How long to wait before looking at the clock and Ctrl-C.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    // Everything that can be wrong on the line is found before anything is sent.
+    let frames = args.frames()?;
+    let triggers = args.triggers(&frames)?;
+    let periodic = args
+        .period
+        .map(|period| (period, args.modifiers.list()))
+        .map(|(period, list)| list.map(|list| (period, list)))
+        .transpose()?;
+    interrupt::watch()?;
+    let device = Device::open(&args.device)?;
+    args.open.open(&device, args.channel, Mode::Normal, &[])?;
+    let mut tally = Tally::new(args.quiet);
+    let waiting = match (triggers, periodic) {
+        (Some(triggers), _) => {
+            let slots = device.hello().trigger_slots;
+            if triggers.len() > usize::from(slots) {
+                bail!("that takes {} of the device's {slots} replies; give fewer frames", triggers.len());
+            }
+            let stream = Stream::new(&device);
+            for (slot, trigger) in (0..).zip(triggers) {
+                device.set_trigger(args.channel, slot, Some(trigger))?;
+            }
+            args.watch(stream, TRIGGER_TAG, &mut tally, args.count.map(u64::from))?
+        }
+        (None, Some((period, modifiers))) => {
+            let ticks = period.as_secs_f64() * f64::from(device.hello().tick_hz);
+            let slots = device.hello().periodic_slots;
+            if frames.len() > usize::from(slots) {
+                bail!("the device keeps {slots} periodic frames and these are {}; give fewer", frames.len());
+            }
+            let stream = Stream::new(&device);
+            for (slot, frame) in (0..).zip(&frames) {
+                let entry = Periodic {
+                    frame: *frame,
+                    // Too long saturates, and the device refuses it.
+                    period_ticks: ticks.round() as u32,
+                    count: args.count.unwrap_or(0),
+                    modifiers: modifiers.clone(),
+                };
+                device
+                    .set_periodic(args.channel, slot, Some(entry))
+                    .with_context(|| format!("--period {period:?}"))?;
+            }
+            let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
+            args.watch(stream, DEVICE_TAG, &mut tally, wanted)?
+        }
+        (None, None) => args.send_now(&device, &frames, &mut tally)?,
+    };
+    device.stop()?;
+    tally.verdict(waiting)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+impl Args {
+    fn frames(&self) -> anyhow::Result<Vec<Frame>> {
+        let database = self.databases.load(false)?;
+        let frame = |text: &String| {
+            // A colon stands in no frame and in every message with values.
+            if text.contains(':') && !text.contains('#') {
+                Ok(signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
+            } else {
+                text.parse().with_context(|| format!("'{text}' is no frame"))
+            }
+        };
+        self.frames.iter().map(frame).collect()
+    }
+
+    /// The replies, if replies are wanted: for each frame one for each hardware filter.
+    fn triggers(&self, frames: &[Frame]) -> anyhow::Result<Option<Vec<Trigger>>> {
+        let count = self.count.unwrap_or(0);
+        if self.reply {
+            let answer = |frame: &Frame| Trigger {
+                filter: exactly(frame.id(), FrameKind::Remote),
+                reply: *frame,
+                count,
+            };
+            return Ok(Some(frames.iter().map(answer).collect()));
+        }
+        let Some(text) = &self.on_rx else { return Ok(None) };
+        let filters = if let Ok(id) = text.parse::<Id>() {
+            vec![exactly(id, FrameKind::Any)]
+        } else {
+            let filter: Filter = text.parse()?;
+            let compiled = hw_filter::compile(&[filter], self.channel);
+            if let Some(remainder) = compiled.remainder {
+                bail!("'{text}' cannot start a reply: {remainder}, which is too late for it");
+            }
+            if compiled.hardware.is_empty() {
+                let all = |extended| HardwareFilter { extended, kind: FrameKind::Any, id: 0, mask: 0 };
+                vec![all(false), all(true)]
+            } else {
+                compiled.hardware
+            }
+        };
+        let each = |filter: &HardwareFilter| {
+            let filter = *filter;
+            frames.iter().map(move |frame| Trigger { filter, reply: *frame, count })
+        };
+        Ok(Some(filters.iter().flat_map(each).collect()))
+    }
+
+    fn is_over(&self, started: Instant) -> bool {
+        interrupt::requested() || self.time.is_some_and(|time| started.elapsed() >= time)
+    }
+
+    /// Sends the frames one after the other, `count` times. Returns how many are still waiting.
+    fn send_now(&self, device: &Device, frames: &[Frame], tally: &mut Tally) -> anyhow::Result<usize> {
+        let mut stream = Stream::new(device);
+        let started = Instant::now();
+        let mut last = Instant::now();
+        'rounds: for _ in 0..self.count.unwrap_or(1) {
+            for frame in frames {
+                let mut stuck = false;
+                let go_on = || {
+                    stuck = last.elapsed() > GIVE_UP_AFTER;
+                    !stuck && !self.is_over(started)
+                };
+                if stream.push(self.channel, *frame, None, go_on)?.is_none() || self.is_over(started) {
+                    break 'rounds;
+                }
+                let ends = stream.take_ended();
+                if !ends.is_empty() {
+                    last = Instant::now();
+                    tally.add(&ends)?;
+                }
+            }
+        }
+        sending::finish(&mut stream, tally)?;
+        Ok(stream.under_way())
+    }
+
+    /// Watches what the device sends by itself, with tags from `first_tag`, until there are as many as wanted.
+    fn watch(
+        &self,
+        mut stream: Stream<'_>,
+        first_tag: u32,
+        tally: &mut Tally,
+        wanted: Option<u64>,
+    ) -> anyhow::Result<usize> {
+        let started = Instant::now();
+        let period = self.period.unwrap_or_default();
+        let mut last = Instant::now();
+        while !self.is_over(started) && wanted.is_none_or(|wanted| tally.sent < wanted) {
+            stream.wait(LOOK_EVERY)?;
+            let mut ends = stream.take_ended();
+            ends.retain(|end| end.tag >= first_tag);
+            if !ends.is_empty() {
+                last = Instant::now();
+            }
+            tally.add(&ends)?;
+            // A bus that takes nothing would keep a counted transmission for ever.
+            if self.period.is_some() && last.elapsed() > period + GIVE_UP_AFTER {
+                return Ok(wanted.map_or(1, |wanted| (wanted - tally.sent) as usize));
+            }
+        }
+        Ok(0)
+    }
+}
+
+/// A filter for one identifier.
+const fn exactly(id: Id, kind: FrameKind) -> HardwareFilter {
+    let extended = id.is_extended();
+    let mask = if extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+    HardwareFilter { extended, kind, id: id.raw(), mask }
+}

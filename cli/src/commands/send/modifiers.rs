@@ -1,0 +1,57 @@
+//! What changes in a periodic frame each time: counters, random bytes, checksums.
+
+use anyhow::bail;
+use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier};
+
+/// The modifiers; applied in this order, so that a checksum covers the others.
+#[derive(clap::Args)]
+pub struct ModifierArgs {
+    /// Count up in a byte of the data (from 0), or in some of its bits: BYTE or BYTE.LOWBIT:BITS, such as 7.0:4.
+    #[arg(long, value_name = "BYTE[.BIT:BITS]", value_parser = counter, requires = "period")]
+    counter: Vec<Modifier>,
+    /// A new random value in a byte.
+    #[arg(long, value_name = "BYTE", requires = "period")]
+    random: Vec<u8>,
+    /// A checksum over the other bytes in a byte: xor, sum, or crc8 (SAE-J1850).
+    #[arg(long, value_name = "BYTE:KIND", value_parser = checksum, requires = "period")]
+    checksum: Vec<Modifier>,
+}
+
+impl ModifierArgs {
+    /// All of them.
+    pub fn list(&self) -> anyhow::Result<heapless::Vec<Modifier, MAX_MODIFIERS>> {
+        let random = self.random.iter().map(|byte| Modifier::Random { byte: *byte });
+        let mut list = heapless::Vec::new();
+        for modifier in self.counter.iter().copied().chain(random).chain(self.checksum.iter().copied()) {
+            if list.push(modifier).is_err() {
+                bail!(
+                    "a frame takes {MAX_MODIFIERS} modifiers; give fewer of --counter, --random, --checksum"
+                );
+            }
+        }
+        Ok(list)
+    }
+}
+
+fn counter(text: &str) -> Result<Modifier, String> {
+    let wrong = || "write a counter as BYTE or BYTE.LOWBIT:BITS, such as 7 or 7.0:4".to_owned();
+    let number = |text: &str| text.parse::<u8>().map_err(|_| wrong());
+    let Some((byte, bits)) = text.split_once('.') else {
+        return Ok(Modifier::Counter { byte: number(text)?, low_bit: 0, bits: 8 });
+    };
+    let (low_bit, bits) = bits.split_once(':').ok_or_else(wrong)?;
+    Ok(Modifier::Counter { byte: number(byte)?, low_bit: number(low_bit)?, bits: number(bits)? })
+}
+
+fn checksum(text: &str) -> Result<Modifier, String> {
+    let parts = text.split_once(':').and_then(|(byte, kind)| {
+        let algorithm = match kind {
+            "xor" => Checksum::Xor,
+            "sum" => Checksum::Sum,
+            "crc8" => Checksum::Crc8J1850,
+            _ => return None,
+        };
+        Some(Modifier::Checksum { byte: byte.parse().ok()?, algorithm })
+    });
+    parts.ok_or_else(|| "write a checksum as BYTE:xor, BYTE:sum or BYTE:crc8".to_owned())
+}

@@ -1,0 +1,171 @@
+//! `cantap status`: a device's state, counters and registers.
+
+use std::io::Write;
+use std::process::ExitCode;
+
+use cantap::wire::message::{ChannelStatus, RegisterSet, Status};
+use cantap::wire::record::{BusErrorKind, ErrorState};
+use cantap::{Address, Channel, Device};
+use serde_json::{Value, json};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Connecting begins a session: it closes both channels and sets the counters to zero.\n\n\
+                        Examples:\n  cantap status -d /dev/ttyACM0\n  cantap status -d virtual --registers --json"
+)]
+pub struct Args {
+    /// Where the device is: a serial port, or virtual.
+    #[arg(short, long)]
+    device: Address,
+    /// The controllers' registers too, now and at the last error.
+    #[arg(long)]
+    registers: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let device = Device::open(&args.device)?;
+    let status = device.status()?;
+    let mut registers = Vec::new();
+    if args.registers {
+        for channel in Channel::ALL {
+            registers.push(device.registers(channel)?);
+        }
+    }
+    let mut out = std::io::stdout().lock();
+    let uptime_s = status.ticks as f64 / f64::from(device.hello().tick_hz);
+    if args.json {
+        let mut object = object(&status, uptime_s, device.hello().queue_bytes);
+        for (channel, registers) in object["channels"].as_array_mut().into_iter().flatten().zip(&registers) {
+            channel["registers"] = register_object(&registers.now);
+            channel["registers_at_last_error"] =
+                registers.at_last_error.as_ref().map_or(Value::Null, register_object);
+        }
+        writeln!(out, "{object}")?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    writeln!(out, "uptime       {uptime_s:.1} s")?;
+    let tenths = |value: i16| format!("{:.1} C", f64::from(value) / 10.0);
+    let unknown = || "not measured by this device".to_owned();
+    writeln!(out, "temperature  {}", status.temperature_decicelsius.map_or_else(unknown, tenths))?;
+    let volts = |value: u16| format!("{:.2} V", f64::from(value) / 1e3);
+    writeln!(out, "supply       {}", status.supply_millivolts.map_or_else(unknown, volts))?;
+    writeln!(
+        out,
+        "queue        {} of {} bytes, at most {}",
+        status.queue_bytes,
+        device.hello().queue_bytes,
+        status.queue_high_water_bytes
+    )?;
+    writeln!(out, "bad requests {}", status.bad_requests)?;
+    for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
+        let open = state.open.map_or("closed".to_owned(), |config| {
+            let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
+            format!("open, {:?}, {bitrate} bit/s", config.mode)
+        });
+        writeln!(out, "\nchannel {}    {open}", channel.number())?;
+        writeln!(out, "  state      {}, TEC {}, REC {}", name(state.state), state.tec, state.rec)?;
+        writeln!(out, "  last error {}", state.last_error.map_or("none", error_name))?;
+        writeln!(
+            out,
+            "  received   {} frames; lost: controller at least {}, queue {}",
+            state.frames, state.lost_controller, state.lost_queue
+        )?;
+        writeln!(
+            out,
+            "  sent       {} frames; failed {}, waiting {}",
+            state.transmitted, state.transmit_failures, state.tx_pending
+        )?;
+        writeln!(out, "  bus errors {}", state.bus_errors)?;
+    }
+    for (channel, registers) in Channel::ALL.into_iter().zip(&registers) {
+        writeln!(out, "\nregisters of channel {}", channel.number())?;
+        writeln!(out, "            {:>8}  at last error", "now")?;
+        let then = registers.at_last_error.as_ref().map(register_values);
+        for (at, (register, value)) in register_values(&registers.now).into_iter().enumerate() {
+            let then = then.map_or("-".to_owned(), |then| format!("{:08X}", then[at].1));
+            writeln!(out, "  CAN_{register:<4}  {value:08X}  {then}")?;
+        }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn object(status: &Status, uptime_s: f64, queue_size_bytes: u32) -> Value {
+    let channels: Vec<Value> = Channel::ALL
+        .into_iter()
+        .zip(&status.channels)
+        .map(|(channel, state)| channel_object(channel, state))
+        .collect();
+    json!({
+        "uptime_s": uptime_s,
+        "temperature_celsius": status.temperature_decicelsius.map(|value| f64::from(value) / 10.0),
+        "supply_volts": status.supply_millivolts.map(|value| f64::from(value) / 1e3),
+        "queue_bytes": status.queue_bytes,
+        "queue_size_bytes": queue_size_bytes,
+        "queue_high_water_bytes": status.queue_high_water_bytes,
+        "bad_requests": status.bad_requests,
+        "channels": channels,
+    })
+}
+
+fn channel_object(channel: Channel, state: &ChannelStatus) -> Value {
+    json!({
+        "channel": channel.number(),
+        "open": state.open.is_some(),
+        "state": name(state.state),
+        "tec": state.tec,
+        "rec": state.rec,
+        "last_error": state.last_error.map(error_name),
+        "frames": state.frames,
+        "lost_controller": state.lost_controller,
+        "lost_queue": state.lost_queue,
+        "bus_errors": state.bus_errors,
+        "transmitted": state.transmitted,
+        "transmit_failures": state.transmit_failures,
+        "tx_pending": state.tx_pending,
+    })
+}
+
+fn register_values(set: &RegisterSet) -> [(&'static str, u32); 7] {
+    [
+        ("MCR", set.mcr),
+        ("MSR", set.msr),
+        ("TSR", set.tsr),
+        ("RF0R", set.rf0r),
+        ("IER", set.ier),
+        ("ESR", set.esr),
+        ("BTR", set.btr),
+    ]
+}
+
+fn register_object(set: &RegisterSet) -> Value {
+    register_values(set)
+        .into_iter()
+        .map(|(name, value)| (name.to_lowercase(), Value::from(format!("0x{value:08X}"))))
+        .collect::<serde_json::Map<_, _>>()
+        .into()
+}
+
+const fn name(state: ErrorState) -> &'static str {
+    match state {
+        ErrorState::Active => "active",
+        ErrorState::Warning => "warning",
+        ErrorState::Passive => "passive",
+        ErrorState::BusOff => "bus-off",
+    }
+}
+
+const fn error_name(kind: BusErrorKind) -> &'static str {
+    match kind {
+        BusErrorKind::Stuff => "stuff",
+        BusErrorKind::Form => "form",
+        BusErrorKind::Acknowledgment => "acknowledgment",
+        BusErrorKind::BitRecessive => "bit recessive",
+        BusErrorKind::BitDominant => "bit dominant",
+        BusErrorKind::Crc => "CRC",
+    }
+}

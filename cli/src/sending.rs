@@ -1,0 +1,95 @@
+//! What commands that send have in common: a device open for sending, and what became of each frame.
+
+use std::io::Write;
+use std::time::Duration;
+
+use anyhow::bail;
+use cantap::device::Transmission;
+use cantap::transmit::Stream;
+use cantap::wire::record::TransmitFailure;
+
+use crate::interrupt;
+
+/// A frame that nobody acknowledged for so long is given up.
+pub const GIVE_UP_AFTER: Duration = Duration::from_secs(1);
+
+/// Counts ends of transmissions, and prints them as candump would.
+#[derive(Default)]
+pub struct Tally {
+    /// Confirmed.
+    pub sent: u64,
+    /// Not sent.
+    pub failed: u64,
+    /// The last reason.
+    reason: Option<TransmitFailure>,
+    quiet: bool,
+}
+
+impl Tally {
+    /// A tally that prints nothing if `quiet`.
+    pub fn new(quiet: bool) -> Self {
+        Self { quiet, ..Self::default() }
+    }
+
+    /// Counts and prints.
+    pub fn add(&mut self, ends: &[Transmission]) -> anyhow::Result<()> {
+        let mut out = std::io::stdout().lock();
+        for end in ends {
+            match end.result {
+                Ok(frame) => {
+                    self.sent += 1;
+                    if !self.quiet {
+                        let (seconds, us) = (end.time_ns / 1_000_000_000, end.time_ns / 1000 % 1_000_000);
+                        writeln!(out, "({seconds}.{us:06}) can{} {frame} T", end.channel.index())?;
+                    }
+                }
+                Err(reason) => {
+                    self.failed += 1;
+                    self.reason = Some(reason);
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// An error that says what to do if anything was not sent.
+    pub fn verdict(&self, still_waiting: usize) -> anyhow::Result<()> {
+        if still_waiting > 0 {
+            bail!(
+                "nobody acknowledged {still_waiting} of {} frames; check that another node is on the bus, at this \
+                 bit rate, and the termination",
+                self.sent + self.failed + still_waiting as u64
+            );
+        }
+        match self.reason {
+            Some(reason) => bail!(
+                "{} of {} frames were not sent: {}",
+                self.failed,
+                self.sent + self.failed,
+                sentence(reason)
+            ),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Waits for the rest of a stream, until nothing ends for [`GIVE_UP_AFTER`] or Ctrl-C, and adds it up.
+pub fn finish(stream: &mut Stream<'_>, tally: &mut Tally) -> anyhow::Result<()> {
+    stream.finish(|since| since < GIVE_UP_AFTER && !interrupt::requested())?;
+    tally.add(&stream.take_ended())
+}
+
+fn sentence(reason: TransmitFailure) -> &'static str {
+    match reason {
+        TransmitFailure::ArbitrationLost => {
+            "arbitration was lost; leave --one-shot away to try again until sent"
+        }
+        TransmitFailure::BusError => {
+            "an error hit them; check bit rate and wiring, or leave --one-shot away to try again until sent"
+        }
+        TransmitFailure::Aborted => "they were aborted",
+        TransmitFailure::Closed => "the channel was closed before",
+        TransmitFailure::BusOff => "the controller went bus-off; check bit rate, wiring and termination",
+        TransmitFailure::Overtaken => "their period is shorter than the bus allows; choose a longer --period",
+    }
+}

@@ -1,0 +1,117 @@
+//! The commands that act on a device and its bus, as users run them, on the virtual device.
+
+use std::process::{Command, Output};
+
+fn cantap(arguments: &str) -> (Option<i32>, String, String) {
+    let output = Command::new(env!("CARGO_BIN_EXE_cantap")).args(arguments.split_whitespace()).output();
+    let Output { status, stdout, stderr } = output.unwrap();
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+/// Frames that a command printed, without their times.
+fn frames(out: &str) -> Vec<String> {
+    out.lines().map(|line| line.split_once(") ").unwrap().1.to_owned()).collect()
+}
+
+/// Times that a command printed, in microseconds.
+fn times_us(out: &str) -> Vec<i64> {
+    out.lines().map(|line| line[1..line.find(')').unwrap()].replace('.', "").parse().unwrap()).collect()
+}
+
+#[test]
+fn a_sent_frame_is_printed_with_its_time() {
+    let (code, out, err) = cantap("send -d virtual can1 123#DEADBEEF 5A1#11.22 1F334455#R2");
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(frames(&out), ["can1 123#DEADBEEF T", "can1 5A1#1122 T", "can1 1F334455#R2 T"]);
+}
+
+#[test]
+fn a_frame_that_nobody_acknowledges_fails_and_says_what_to_check() {
+    let (code, out, err) = cantap("send -d virtual:ack=no,load=0 can0 123#");
+    assert_eq!((code, out.as_str()), (Some(1), ""));
+    assert!(err.contains("nobody acknowledged 1 of 1 frames; check"), "{err}");
+    let (code, _, err) = cantap("send -d virtual:ack=no,load=0 can0 123# --one-shot");
+    assert!(code == Some(1) && err.contains("--one-shot"), "{err}");
+}
+
+#[test]
+fn listen_only_refuses_to_send_and_says_how_to() {
+    let (code, out, err) = cantap("send -d virtual can0 123# --mode listen");
+    assert_eq!((code, out.as_str(), err.lines().count()), (Some(1), "", 1));
+    assert!(err.contains("--mode normal"), "{err}");
+}
+
+#[test]
+fn periodic_frames_count_and_carry_their_checksum() {
+    let line =
+        "send -d virtual:load=0 can0 123#0F22F000 --period 5ms --count 4 --counter 0.0:4 --checksum 3:xor";
+    let (code, out, err) = cantap(line);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let expected =
+        ["can0 123#0F22F0DD T", "can0 123#0022F0D2 T", "can0 123#0122F0D3 T", "can0 123#0222F0D0 T"];
+    assert_eq!(frames(&out), expected);
+    let times = times_us(&out);
+    for pair in times.windows(2) {
+        assert!((pair[1] - pair[0] - 5000).abs() < 50, "{times:?}");
+    }
+}
+
+/// Every frame of a busy bus starts a reply; the count ends them.
+#[test]
+fn a_reply_follows_what_its_filter_accepts() {
+    let (code, out, err) = cantap("send -d virtual:load=100,frames=std8 can0 7FF#AA --on-rx 000:0 --count 3");
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(frames(&out)[..3], ["can0 7FF#AA T"; 3]);
+    let (code, _, err) = cantap("send -d virtual can0 7FF#AA --on-rx 123~7FF");
+    assert!(code == Some(1) && err.contains("inverse"), "{err}");
+}
+
+#[test]
+fn faulty_lines_are_refused_before_anything_is_sent() {
+    for (line, code, part) in [
+        ("send -d virtual can2 123#", 2, "can0"),
+        ("send -d virtual can0 123", 1, "123#DEADBEEF"),
+        ("send -d virtual can0 800#", 1, "7FF"),
+        ("send -d virtual can0 123# --counter 0", 2, "--period"),
+        ("send -d virtual can0 123#00 --period 1us", 1, "period"),
+        ("send -d virtual can0 123#00 --period 10ms --counter 1", 1, "modifier"),
+        ("send -d virtual can0 123#00 -b 999999", 1, "947368"),
+        ("send -d virtual can0 123#00 -b 500k --triple", 1, "samples each bit once"),
+        ("send -d /dev/null/nothing can0 123#", 1, "cantap list"),
+    ] {
+        let (found, out, err) = cantap(line);
+        assert_eq!((found, out.as_str()), (Some(code), ""), "{line}: {err}");
+        assert!(err.contains(part), "{line}: {err}");
+    }
+}
+
+#[test]
+fn status_has_the_documented_keys() {
+    let (code, out, _) = cantap("status -d virtual --registers --json");
+    assert_eq!(code, Some(0));
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    let keys =
+        |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>().join(" ");
+    assert_eq!(
+        keys(&object),
+        "bad_requests channels queue_bytes queue_high_water_bytes queue_size_bytes supply_volts temperature_celsius uptime_s"
+    );
+    let channel = &object["channels"][1];
+    assert_eq!((&channel["channel"], &channel["state"]), (&2.into(), &"active".into()));
+    assert_eq!(keys(&channel["registers"]), "btr esr ier mcr msr rf0r tsr");
+    assert!(channel["registers_at_last_error"].is_null());
+}
+
+#[test]
+fn device_care_is_one_line_each() {
+    for (line, out) in [
+        ("identify -d virtual -s 2", "its LEDs blink for 2 s\n"),
+        ("reset -d virtual", "restarting\n"),
+        ("defaults save -d virtual -b 250k --mode normal", "saved on the device\n"),
+        ("defaults clear -d virtual", "erased from the device\n"),
+    ] {
+        assert_eq!(cantap(line), (Some(0), out.to_owned(), String::new()), "{line}");
+    }
+    let (code, _, err) = cantap("update -d virtual Cargo.toml");
+    assert!(code == Some(1) && err.contains("no firmware image"), "{err}");
+}

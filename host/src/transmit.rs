@@ -1,0 +1,165 @@
+//! Sends frames in a stream: many under way at once, never more than the device's queue holds, each accounted for.
+//!
+//! A request carries a few frames and its answer takes a USB round trip, so several requests are under way at a time. What
+//! is not confirmed yet is counted, and no more is sent than fits the device's queue: it never refuses, so
+//! the order is kept.
+
+use std::collections::VecDeque;
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use cantap_wire::message::{MAX_SEND, TxFrame};
+use cantap_wire::{CHANNELS, Channel, Command, Frame};
+
+use crate::device::{Pending, Transmission};
+use crate::{Device, DeviceError};
+
+/// Requests under way: with eight frames each, more than a bus takes in a USB round trip.
+const REQUESTS: usize = 4;
+/// How long to wait for a confirmation before looking whether to go on.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// Tags wrap here, far below the device's own and far above what is under way.
+const TAGS: u32 = 1 << 24;
+
+#[derive(Default)]
+struct Lane {
+    batch: heapless::Vec<TxFrame, MAX_SEND>,
+    /// Handed to the device and not confirmed.
+    under_way: usize,
+    next_tag: u32,
+}
+
+/// A stream of frames to one device's channels.
+pub struct Stream<'d> {
+    device: &'d Device,
+    confirmations: Receiver<Transmission>,
+    lanes: [Lane; CHANNELS],
+    requests: VecDeque<Pending<'d>>,
+    /// Ends, in the device's order, for [`Self::take_ended`].
+    ended: Vec<Transmission>,
+}
+
+impl<'d> Stream<'d> {
+    /// A stream to a device whose channels are open; it takes the device's confirmations over.
+    pub fn new(device: &'d Device) -> Self {
+        Self {
+            device,
+            confirmations: device.transmissions(),
+            lanes: Default::default(),
+            requests: VecDeque::new(),
+            ended: Vec::new(),
+        }
+    }
+
+    /// Adds a frame, to be sent not before a device time. Waits while the device's queue is full, and returns
+    /// false if `go_on` said no meanwhile. Returns the tag that its confirmation will bear.
+    pub fn push(
+        &mut self,
+        channel: Channel,
+        frame: Frame,
+        at_ticks: Option<u64>,
+        mut go_on: impl FnMut() -> bool,
+    ) -> Result<Option<u32>, DeviceError> {
+        let room = usize::from(self.device.hello().tx_queue).max(1);
+        while self.lane(channel).under_way + self.lane(channel).batch.len() >= room {
+            // All of it has to be on its way before anything can be waited for.
+            self.flush()?;
+            self.collect(LOOK_EVERY)?;
+            if !go_on() {
+                return Ok(None);
+            }
+        }
+        let lane = self.lane(channel);
+        let tag = lane.next_tag;
+        lane.next_tag = (tag + 1) % TAGS;
+        // Cannot fail: a full batch is sent below.
+        let _ = lane.batch.push(TxFrame { tag, frame, at_ticks });
+        if lane.batch.is_full() {
+            self.send(channel)?;
+        }
+        self.collect(Duration::ZERO)?;
+        Ok(Some(tag))
+    }
+
+    /// Hands everything to the device.
+    pub fn flush(&mut self) -> Result<(), DeviceError> {
+        for channel in Channel::ALL {
+            if !self.lane(channel).batch.is_empty() {
+                self.send(channel)?;
+            }
+        }
+        while let Some(request) = self.requests.pop_front() {
+            request.wait()?;
+        }
+        Ok(())
+    }
+
+    /// Waits until everything has ended, as long as `go_on` says so; it is given the time since the last end.
+    /// Returns whether everything has.
+    pub fn finish(&mut self, mut go_on: impl FnMut(Duration) -> bool) -> Result<bool, DeviceError> {
+        self.flush()?;
+        let mut last = Instant::now();
+        while self.under_way() > 0 {
+            let before = self.ended.len();
+            self.collect(LOOK_EVERY)?;
+            if self.ended.len() > before {
+                last = Instant::now();
+            } else if !go_on(last.elapsed()) {
+                return Ok(false);
+            }
+        }
+        Ok(true)
+    }
+
+    /// Waits for the next end of a transmission, at most so long.
+    pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
+        self.collect(at_most)
+    }
+
+    /// Frames handed over that have not ended.
+    pub fn under_way(&self) -> usize {
+        self.lanes.iter().map(|lane| lane.under_way).sum()
+    }
+
+    /// How transmissions ended since the last call, in the device's order.
+    pub fn take_ended(&mut self) -> Vec<Transmission> {
+        std::mem::take(&mut self.ended)
+    }
+
+    fn lane(&mut self, channel: Channel) -> &mut Lane {
+        &mut self.lanes[channel.index()]
+    }
+
+    fn send(&mut self, channel: Channel) -> Result<(), DeviceError> {
+        let lane = self.lane(channel);
+        let frames = std::mem::take(&mut lane.batch);
+        lane.under_way += frames.len();
+        if self.requests.len() >= REQUESTS
+            && let Some(oldest) = self.requests.pop_front()
+        {
+            oldest.wait()?;
+        }
+        self.requests.push_back(self.device.request_later(Command::Send { channel, frames })?);
+        Ok(())
+    }
+
+    /// Takes confirmations: what is there, after at most `wait` for the first.
+    fn collect(&mut self, wait: Duration) -> Result<(), DeviceError> {
+        let mut wait = wait;
+        loop {
+            match self.confirmations.recv_timeout(wait) {
+                Ok(end) => {
+                    if end.tag < TAGS {
+                        let lane = self.lane(end.channel);
+                        lane.under_way = lane.under_way.saturating_sub(1);
+                    }
+                    self.ended.push(end);
+                    wait = Duration::ZERO;
+                }
+                Err(RecvTimeoutError::Timeout) => return Ok(()),
+                // The reader has ended: a request tells why.
+                Err(RecvTimeoutError::Disconnected) => return self.device.time().map(|_| ()),
+            }
+        }
+    }
+}

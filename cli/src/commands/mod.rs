@@ -2,8 +2,8 @@
 
 pub mod bits;
 pub mod capture;
-pub mod completions;
 pub mod care;
+pub mod completions;
 pub mod decode;
 pub mod demo;
 pub mod diff;

@@ -11,12 +11,17 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
 use rsemu::core::error::BusError;
 use rsemu::core::space::{
-    AccessConstraints, AddressSpace, Mapping, MemAttrs, MemOps, MemResult, Perms, RamStore, Region,
+    AccessConstraints, AddressSpace, DispatchPolicy, Mapping, MemAttrs, MemOps, MemResult, Perms, RamStore,
+    Region,
 };
 use rsemu::cpu::arm::v7m::sys::Exception;
 use rsemu::cpu::arm::v7m::{ArmV7m, Config, Regs, xpsr};
 
 use crate::memory_map as map;
+
+/// A table of 64 KiB pages finds memories and peripherals faster than a search; the few above it are
+/// searched for.
+const PAGES: DispatchPolicy = DispatchPolicy::Dense { page_bits: 16, cover: map::PERIPHERALS.end as u64 };
 
 /// Everything the core reaches that is not memory. The addresses are absolute.
 pub trait Bus: Send + Sync {
@@ -79,8 +84,12 @@ impl MemOps for Window {
 /// The processor's registers, as far as anything outside needs them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct State {
-    /// R0 to R15.
-    pub r: [u32; 16],
+    /// R15: address of the next instruction.
+    pub pc: u32,
+    /// R14.
+    pub lr: u32,
+    /// R13.
+    pub sp: u32,
     /// Program status; bits 8..0 are the exception number.
     pub xpsr: u32,
     /// PRIMASK: everything but NMI and HardFault is held off.
@@ -92,11 +101,6 @@ pub struct State {
 }
 
 impl State {
-    /// Address of the next instruction.
-    pub fn pc(&self) -> u32 {
-        self.r[15]
-    }
-
     /// The active exception's number: 0 in thread mode, 3 HardFault, 16 + n external interrupt n.
     pub fn exception(&self) -> u16 {
         (self.xpsr & xpsr::EXCEPTION) as u16
@@ -110,7 +114,9 @@ impl State {
 impl From<Regs> for State {
     fn from(regs: Regs) -> Self {
         Self {
-            r: regs.r,
+            pc: regs.r[15],
+            lr: regs.r[14],
+            sp: regs.r[13],
             xpsr: regs.xpsr,
             primask: regs.primask,
             basepri: regs.basepri,
@@ -202,7 +208,7 @@ impl Cpu {
     pub fn new(memories: Memories, bus: &Arc<dyn Bus>) -> Self {
         let clock = Arc::new(AtomicU64::new(0));
         let touched = Arc::new(AtomicBool::new(false));
-        let space = AddressSpace::new("stm32f405", 32);
+        let space = AddressSpace::new("stm32f405", 32).with_dispatch(PAGES);
         {
             let mut topology = space.topology();
             let mut put = |region: Region, base: u32, perms: Perms, priority: i32| {
@@ -261,7 +267,12 @@ impl Cpu {
 
     /// Whether the last steps reached beyond memory; asking clears it.
     pub fn take_touched(&self) -> bool {
-        self.touched.swap(false, Ordering::Relaxed)
+        // One thread only; a swap would cost a bus lock in every step.
+        let touched = self.touched.load(Ordering::Relaxed);
+        if touched {
+            self.touched.store(false, Ordering::Relaxed);
+        }
+        touched
     }
 
     /// Whether the firmware asked for a system reset (AIRCR.SYSRESETREQ).
@@ -312,7 +323,7 @@ impl Cpu {
         let cycles = if before.in_it_block() { self.step_in_it_block(before) } else { self.core.step() };
         self.now += cycles;
         self.state = self.core.regs().into();
-        if cycles == 1 && self.state.pc() == before.pc() {
+        if cycles == 1 && self.state.pc == before.pc {
             self.asleep = self.core.is_asleep();
         }
         cycles

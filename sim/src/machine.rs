@@ -212,7 +212,7 @@ impl Machine {
         if self.cpu.take_touched() {
             self.refresh();
         }
-        if self.panics.contains(&after.pc()) {
+        if self.panics.contains(&after.pc) {
             return Err(self.stopped(Reason::Panic));
         }
         self.look_in -= 1;
@@ -251,7 +251,7 @@ impl Machine {
             return;
         }
         let waits = self.lines & CAPTURE_LINES != 0;
-        let window = self.probe.masked(masked, waits, self.cpu.now(), state.pc());
+        let window = self.probe.masked(masked, waits, self.cpu.now(), state.pc);
         if let (Some(window), Some(trace)) = (window, &mut self.trace) {
             trace.masked(window.start, window.start + window.cycles);
         }
@@ -268,7 +268,7 @@ impl Machine {
         if self.cpu.locked_up() {
             return Err(self.stopped(Reason::LockUp));
         }
-        if map::SYSTEM_MEMORY.contains(&self.cpu.state().pc()) {
+        if map::SYSTEM_MEMORY.contains(&self.cpu.state().pc) {
             return Err(self.stopped(Reason::Bootloader));
         }
         if self.cpu.reset_requested() {

@@ -137,7 +137,7 @@ impl Probe {
             return None;
         }
         // Only an entry pushes a frame; a return or a chained entry takes one off or leaves it.
-        let entered = after.r[13].wrapping_add(0x20) <= before.r[13];
+        let entered = after.sp.wrapping_add(0x20) <= before.sp;
         let owner = if entered { to } else { from };
         self.cycles[usize::from(owner) % EXCEPTIONS] += cycles;
         if entered {

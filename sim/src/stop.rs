@@ -68,7 +68,7 @@ impl Stopped {
     /// Describes where the core is now. In a fault handler that is where the fault came from.
     pub(crate) fn here(reason: Reason, cpu: &Cpu, image: &Image) -> Self {
         let state = cpu.state();
-        let [mut pc, mut lr, mut sp] = [state.pc(), state.r[14], state.r[13]];
+        let [mut pc, mut lr, mut sp] = [state.pc, state.lr, state.sp];
         if matches!(reason, Reason::HardFault(_) | Reason::LockUp) {
             // The frame the fault pushed: R0 to R3, R12, LR, PC, xPSR.
             pc = cpu.word(sp.wrapping_add(24)).unwrap_or(pc);

@@ -7,6 +7,8 @@ use cantap::TraceRecord;
 use cantap::filter::Filter;
 use cantap::formats::{Format, ReadOptions, TraceReader, open_reader};
 
+use crate::live::{LiveArgs, LiveRecords};
+
 /// How to read a trace; for commands to flatten into theirs.
 #[derive(clap::Args)]
 pub struct ReadArgs {
@@ -27,12 +29,17 @@ pub struct ReadArgs {
 /// Broken lines are told one by one until it is clear that the whole file is.
 const ISSUES_SHOWN: u64 = 20;
 
-/// The records of a trace. Issues go to standard error.
+/// The records of a trace or a device. Issues go to standard error.
 pub struct Records {
-    reader: TraceReader,
+    source: Source,
     filters: Vec<Filter>,
     strict: bool,
-    live: bool,
+}
+
+enum Source {
+    /// A file, and whether it may grow.
+    File(TraceReader, bool),
+    Device(LiveRecords),
 }
 
 impl ReadArgs {
@@ -40,37 +47,63 @@ impl ReadArgs {
     pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
         let options = ReadOptions { format: self.format, follow: self.follow, strict: self.strict };
         let reader = open_reader(path, &options)?;
-        let live = self.follow || path.as_os_str() == "-";
-        Ok(Records { reader, filters: self.filter.clone(), strict: self.strict, live })
+        let grows = self.follow || path.as_os_str() == "-";
+        Ok(self.records(Source::File(reader, grows)))
+    }
+
+    /// Opens the device if one was given, else the file.
+    pub fn open_either(&self, path: Option<&Path>, live: &LiveArgs) -> anyhow::Result<Records> {
+        match (live.open()?, path) {
+            (Some(live), _) => Ok(self.records(Source::Device(live))),
+            (None, Some(path)) => self.open(path),
+            (None, None) => bail!("give a trace to read, or a device with -d"),
+        }
+    }
+
+    fn records(&self, source: Source) -> Records {
+        Records { source, filters: self.filter.clone(), strict: self.strict }
     }
 }
 
 impl Records {
-    /// Whether more may come at any time, so that results should not wait in a buffer.
-    pub fn is_live(&self) -> bool {
-        self.live
+    /// Whether the next record may take a while, so that results should not wait in a buffer.
+    pub fn may_wait(&self) -> bool {
+        match &self.source {
+            Source::File(_, grows) => *grows,
+            Source::Device(live) => !live.has_next(),
+        }
     }
 
     /// The next record that passes the filters; `None` at the end. With `--strict`, an issue is an error.
     pub fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
         loop {
-            match self.reader.next() {
-                None => break,
-                Some(Ok(record)) => {
-                    if self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(&record)) {
-                        return Ok(Some(record));
-                    }
-                }
-                Some(Err(issue)) if self.strict => bail!(issue),
-                Some(Err(issue)) if self.reader.issues() <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
-                Some(Err(_)) => {}
+            let record = match &mut self.source {
+                Source::File(reader, _) => next_of_file(reader, self.strict)?,
+                Source::Device(live) => live.next()?,
+            };
+            let Some(record) = record else { return Ok(None) };
+            if self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(&record)) {
+                return Ok(Some(record));
             }
         }
-        match self.reader.issues() {
-            0 => {}
-            1 => eprintln!("cantap: 1 place in the file could not be read and was left out"),
-            issues => eprintln!("cantap: {issues} places in the file could not be read and were left out"),
-        }
-        Ok(None)
     }
+}
+
+/// The next record; says what is wrong on the way, and at the end how often that was.
+fn next_of_file(reader: &mut TraceReader, strict: bool) -> anyhow::Result<Option<TraceRecord>> {
+    loop {
+        match reader.next() {
+            None => break,
+            Some(Ok(record)) => return Ok(Some(record)),
+            Some(Err(issue)) if strict => bail!(issue),
+            Some(Err(issue)) if reader.issues() <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
+            Some(Err(_)) => {}
+        }
+    }
+    match reader.issues() {
+        0 => {}
+        1 => eprintln!("cantap: 1 place in the file could not be read and was left out"),
+        issues => eprintln!("cantap: {issues} places in the file could not be read and were left out"),
+    }
+    Ok(None)
 }

@@ -6,6 +6,7 @@ mod commands;
 mod databases;
 mod input;
 mod interrupt;
+mod live;
 mod losses;
 mod meter;
 mod sending;

@@ -10,26 +10,30 @@ use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cantap::TraceRecord;
 use cantap::signals::{Decoder, Message, SignalValue};
+use cantap::{TraceEvent, TraceRecord};
 
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
+use crate::live::LiveArgs;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
     cantap decode --db car.dbc trace.log\n  \
     cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
-    candump -L can0 | cantap decode --db car.dbc - --json\n\n\
+    candump -L can0 | cantap decode --db car.dbc - --json\n  \
+    cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
 JSON lines are {\"t\", \"ch\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
     identifier in hexadecimal (3 or 8 digits),\nphysical values (null where a float is not a number).")]
 pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     /// The trace; - for standard input.
-    #[arg(value_name = "IN")]
-    input: PathBuf,
+    #[arg(value_name = "IN", required_unless_present = "device")]
+    input: Option<PathBuf>,
+    #[command(flatten)]
+    live: LiveArgs,
     /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Can be repeated.
     #[arg(short, long = "signal", value_name = "PATTERN")]
     signals: Vec<String>,
@@ -57,6 +61,7 @@ struct Count {
     frames: u64,
     decoded: u64,
     signals: u64,
+    lost: u64,
 }
 
 /// Runs it.
@@ -68,19 +73,25 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
     let count = decode(args, &decoder, &mut out)?;
     out.flush()?;
-    let Count { frames, decoded, signals } = count;
+    let Count { frames, decoded, signals, lost } = count;
     eprintln!("cantap: decoded {decoded} of {frames} frames, {signals} values");
+    if lost > 0 {
+        eprintln!("cantap: {lost} frames or more are missing in the trace");
+    }
     Ok(ExitCode::SUCCESS)
 }
 
 fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<Count> {
-    let mut records = args.read.open(&args.input)?;
+    let mut records = args.read.open_either(args.input.as_deref(), &args.live)?;
     let mut count = Count::default();
     let mut values = Vec::new();
     if args.csv {
         csv::write_header(out)?;
     }
     while let Some(record) = records.next()? {
+        if let TraceEvent::Lost { count: lost, .. } = record.event {
+            count.lost += u64::from(lost);
+        }
         let Some(frame) = record.frame() else { continue };
         count.frames += 1;
         let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
@@ -97,7 +108,7 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
             (_, true) => csv::write(out, &decoded)?,
             _ => text::write(out, &decoded)?,
         }
-        if records.is_live() {
+        if records.may_wait() {
             out.flush()?;
         }
     }

@@ -59,7 +59,7 @@ pub struct Args {
     #[arg(short, long, value_name = "N")]
     max_count: Option<u64>,
     /// Print only how many were found.
-    #[arg(short, long, conflicts_with_all = ["output", "json"])]
+    #[arg(long, conflicts_with_all = ["output", "json"])]
     count: bool,
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
@@ -98,7 +98,6 @@ fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64>
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
     let mut records = args.read.open(&args.input)?;
-    let live = records.is_live();
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
     let (mut found, mut still_after) = (0, 0);
     // Whether something lies between the last record shown and the next.
@@ -126,7 +125,7 @@ fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64>
                 gap = true;
             }
         }
-        if live {
+        if records.may_wait() {
             sink.flush()?;
         }
     }

@@ -2,7 +2,7 @@
 //! batch carries an absolute time of its own.
 
 use cantap_wire::batch::BatchWriter;
-use cantap_wire::record::{self, Record};
+use cantap_wire::record::{self, Outline};
 
 use crate::TICKS_PER_MS;
 use crate::queue::Consumer;
@@ -55,24 +55,20 @@ impl Sender {
     fn take(&mut self, bytes: &[u8], now: u32) -> usize {
         let mut rest = bytes;
         while !rest.is_empty() {
-            let Ok((record, difference, after)) = record::decode(rest) else {
+            let Ok(Outline { len, ticks, frame_of }) = record::outline(rest) else {
                 // Cannot happen, since the recorder wrote it; if it did, the rest could not be read either.
                 rest = &[];
                 break;
             };
-            let frame_of = match &record {
-                Record::Received(received) => Some(received.channel),
-                Record::Event(_) => None,
-            };
             if self.batch.is_empty() {
                 self.started = now;
             }
-            let len = rest.len() - after.len();
-            if !self.batch.push(&rest[..len], self.running_ticks, frame_of) {
+            let (record, after) = rest.split_at(len);
+            if !self.batch.push(record, self.running_ticks, frame_of) {
                 self.full = true;
                 break;
             }
-            self.running_ticks = self.running_ticks.wrapping_add_signed(i64::from(difference));
+            self.running_ticks = self.running_ticks.wrapping_add_signed(i64::from(ticks));
             rest = after;
         }
         bytes.len() - rest.len()

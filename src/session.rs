@@ -158,6 +158,9 @@ impl<'q, const N: usize> Session<'q, N> {
         if self.language == Language::Unknown || self.inbox.first() == Some(0) {
             return self.choose_language(board);
         }
+        if self.inbox.first().is_none() {
+            return false;
+        }
         match self.language {
             Language::Native { greeted } => self.handle_request(greeted, board),
             Language::Slcan => self.handle_line(board),

@@ -338,30 +338,26 @@ pub struct Outline {
 /// everything that [`decode`] takes, and says the same of it.
 #[inline]
 pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
-    match *bytes {
-        // A received frame without qualifiers: nearly all there is.
-        [header @ FRAME..=u8::MAX, ref rest @ ..] => {
-            let id_len = if header & 0x20 == 0 { 2 } else { 4 };
-            let remote = header & 0x10 != 0;
-            let data_len = if remote { 0 } else { usize::from(header & 15).min(8) };
-            let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
-            let after_id = rest.get(id_len..).ok_or(BadRecord)?;
-            let (ticks, after) = decode_ticks(after_id)?;
-            let len = bytes.len() - after.len() + data_len;
-            if len > bytes.len() {
-                return Err(BadRecord);
-            }
-            Ok(Outline { len, ticks, frame_of: Some(channel) })
+    // A received frame without qualifiers: nearly all there is.
+    if let [header @ FRAME..=u8::MAX, ref rest @ ..] = *bytes {
+        let id_len = if header & 0x20 == 0 { 2 } else { 4 };
+        let remote = header & 0x10 != 0;
+        let data_len = if remote { 0 } else { usize::from(header & 15).min(8) };
+        let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
+        let after_id = rest.get(id_len..).ok_or(BadRecord)?;
+        let (ticks, after) = decode_ticks(after_id)?;
+        let len = bytes.len() - after.len() + data_len;
+        if len > bytes.len() {
+            return Err(BadRecord);
         }
-        _ => {
-            let (record, ticks, after) = decode(bytes)?;
-            let frame_of = match record {
-                Record::Received(received) => Some(received.channel),
-                Record::Event(_) => None,
-            };
-            Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of })
-        }
+        return Ok(Outline { len, ticks, frame_of: Some(channel) });
     }
+    let (record, ticks, after) = decode(bytes)?;
+    let frame_of = match record {
+        Record::Received(received) => Some(received.channel),
+        Record::Event(_) => None,
+    };
+    Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of })
 }
 
 #[cfg(test)]

@@ -83,23 +83,18 @@ impl FrameBits {
         } else {
             (raw << 7 | remote << 6 | dlc, STANDARD_HEADER_BITS)
         };
-        let data_len = frame.data_len();
-        let data = u64::from_be_bytes(frame.padded_data());
-
-        let mut crc = 0;
-        for (position, byte) in header.to_le_bytes()[..header_bits.div_ceil(8) as usize].iter().enumerate() {
-            crc ^= CRC_OF[data_len + position][usize::from(*byte)];
-        }
-        for (index, byte) in frame.data().iter().enumerate() {
-            crc ^= CRC_OF[data_len - 1 - index][usize::from(*byte)];
-        }
-
+        let data_bits = 8 * frame.data_len() as u32;
+        let data = u128::from(u64::from_be_bytes(frame.padded_data())) >> (64 - data_bits);
+        let message = u128::from(header) << data_bits | data;
+        let message_bits = header_bits + data_bits;
+        let crc = CRC_OF
+            .iter()
+            .zip(message.to_le_bytes())
+            .take(message_bits.div_ceil(8) as usize)
+            .fold(0, |crc, (table, byte)| crc ^ table[usize::from(byte)]);
         // Everything that is stuffed, first bit on top.
-        let data_bits = 8 * data_len as u32;
-        let stuffed_bits = header_bits + data_bits + CRC_BITS;
-        let sequence = u128::from(header) << (128 - header_bits)
-            | u128::from(data) << (64 - header_bits)
-            | u128::from(crc) << (128 - stuffed_bits);
+        let stuffed_bits = message_bits + CRC_BITS;
+        let sequence = (message << CRC_BITS | u128::from(crc)) << (128 - stuffed_bits);
         Self {
             unstuffed: stuffed_bits + TAIL_BITS + INTERMISSION_BITS,
             stuff: count_stuff_bits(sequence, stuffed_bits),
@@ -128,24 +123,38 @@ pub fn bits_on_bus(frame: &Frame) -> u32 {
 
 /// Counts stuff bits of the top `len` bits of `sequence` (at most 118).
 ///
-/// After five equal bits the opposite one is inserted, and that one counts for the next five: the
-/// next place is four bits on if they all repeat it, else where five equal bits end that begin later.
+/// After five equal bits the opposite one is inserted, and that one counts for the next five. So a run of
+/// five to nine equal bits has one stuff bit, and nearly all runs are like that; only a longer run, or one of exactly
+/// five with exactly four of the opposite behind it, needs a closer look.
 #[inline]
 fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
     // Bit i of each mask, counted from the top, speaks of bit i of the sequence.
-    let first = 1 << 127;
-    let same_as_before = !(sequence ^ sequence >> 1) & !first;
+    let same_as_before = !(sequence ^ sequence >> 1) & !TOP_BIT;
     let valid = !(u128::MAX >> len);
-    let last_three_same = same_as_before & same_as_before >> 1 & same_as_before >> 2;
-    let five_equal = last_three_same & same_as_before >> 3 & valid;
-    let four_equal_after_a_change = last_three_same & !(same_as_before >> 3) & valid;
+    let four_equal = same_as_before & same_as_before >> 1 & same_as_before >> 2;
+    let five_equal = four_equal & same_as_before >> 3 & valid;
+    let four_equal_after_a_change = four_equal & !(same_as_before >> 3) & valid;
 
+    let ends = five_equal & !(five_equal >> 1);
+    let two_fives = five_equal & five_equal >> 5;
+    if two_fives | ends >> 4 & four_equal_after_a_change == 0 {
+        return ends.count_ones();
+    }
+    count_one_by_one(five_equal, four_equal_after_a_change)
+}
+
+/// The first bit of a sequence.
+const TOP_BIT: u128 = 1 << 127;
+
+/// The next stuff bit is four bits on if they all repeat the last one, else where five equal bits end that begin
+/// later.
+fn count_one_by_one(five_equal: u128, four_equal_after_a_change: u128) -> u32 {
     let mut count = 0;
     let mut ahead = five_equal;
     while ahead != 0 {
         let mut place = ahead.leading_zeros();
         count += 1;
-        while four_equal_after_a_change << (place + 4) & first != 0 {
+        while four_equal_after_a_change << (place + 4) & TOP_BIT != 0 {
             place += 4;
             count += 1;
         }

@@ -95,6 +95,12 @@ impl Frame {
         Self { id, remote, dlc, data: kept }
     }
 
+    /// A frame whose parts are as [`Self::from_bus`] would make them: a DLC of four bits, and zeros beyond the data.
+    #[inline]
+    pub(crate) const fn from_clean_parts(id: Id, remote: bool, dlc: u8, data: [u8; 8]) -> Self {
+        Self { id, remote, dlc, data }
+    }
+
     /// The identifier.
     pub const fn id(&self) -> Id {
         self.id

@@ -277,28 +277,38 @@ fn decode_ticks(bytes: &[u8]) -> Result<(i32, &[u8]), BadRecord> {
 /// Reads one record: the record, its time difference in ticks, and what follows it.
 #[inline]
 pub fn decode(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
-    let (&first, rest) = bytes.split_first().ok_or(BadRecord)?;
-    if first < QUALIFIED {
-        let (event, rest) = postcard::take_from_bytes::<Event>(bytes).map_err(|_| BadRecord)?;
-        let (ticks, rest) = decode_ticks(rest)?;
-        return Ok((Record::Event(event), ticks, rest));
+    // Nearly every record is a frame without qualifiers.
+    match *bytes {
+        [header @ FRAME..=0xFF, ref rest @ ..] => decode_frame(0, header, rest),
+        [qualified @ QUALIFIED..=0x7F, header @ FRAME..=0xFF, ref rest @ ..] => {
+            let qualifiers = qualified & !QUALIFIER_MASK;
+            if qualified & QUALIFIER_MASK != QUALIFIED || qualifiers == 0 {
+                return Err(BadRecord);
+            }
+            decode_frame(qualifiers, header, rest)
+        }
+        [0..QUALIFIED, ..] => decode_event(bytes),
+        _ => Err(BadRecord),
     }
-    let (qualifiers, header, rest) = if first >= FRAME {
-        (0, first, rest)
-    } else {
-        let (&header, rest) = rest.split_first().ok_or(BadRecord)?;
-        (first & !QUALIFIER_MASK, header, rest)
-    };
+}
+
+#[cold]
+fn decode_event(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
+    let (event, rest) = postcard::take_from_bytes::<Event>(bytes).map_err(|_| BadRecord)?;
+    let (ticks, rest) = decode_ticks(rest)?;
+    Ok((Record::Event(event), ticks, rest))
+}
+
+/// Reads a received frame behind its header byte.
+#[inline(always)]
+#[allow(clippy::inline_always, reason = "the host's decoder is a third slower without")]
+fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
     let stamp = match qualifiers & (UPPER_BOUND | NO_STAMP) {
         0 => Stamp::Exact,
         UPPER_BOUND => Stamp::UpperBound,
         NO_STAMP => Stamp::Omitted,
         _ => return Err(BadRecord),
     };
-    let qualifiers_known = first >= FRAME || first & QUALIFIER_MASK == QUALIFIED && qualifiers != 0;
-    if header < FRAME || !qualifiers_known {
-        return Err(BadRecord);
-    }
     let (id, rest) = if header & 0x20 == 0 {
         let (raw, rest) = rest.split_first_chunk::<2>().ok_or(BadRecord)?;
         (Id::standard(u32::from(u16::from_le_bytes(*raw))), rest)
@@ -312,14 +322,21 @@ pub fn decode(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
     let dlc = header & 15;
     let data_omitted = qualifiers & NO_DATA != 0;
     let data_len = if remote || data_omitted { 0 } else { dlc.min(8) as usize };
-    let mut data = [0; 8];
-    if rest.len() < data_len {
-        return Err(BadRecord);
-    }
-    let (bytes, rest) = rest.split_at(data_len);
-    data[..data_len].copy_from_slice(bytes);
+    let (data, rest) = match (rest.split_first_chunk::<8>(), rest.split_at_checked(data_len)) {
+        // More follows than the data: eight bytes are read at once, and those that are not the frame's dropped.
+        (Some((eight, _)), Some((_, rest))) => {
+            let kept = if data_len == 8 { u64::MAX } else { (1 << (8 * data_len)) - 1 };
+            ((u64::from_le_bytes(*eight) & kept).to_le_bytes(), rest)
+        }
+        (None, Some((bytes, rest))) => {
+            let mut data = [0; 8];
+            data[..data_len].copy_from_slice(bytes);
+            (data, rest)
+        }
+        _ => return Err(BadRecord),
+    };
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
-    let frame = Frame::from_bus(id, remote, dlc, data);
+    let frame = Frame::from_clean_parts(id, remote, dlc, data);
     Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
 }
 

@@ -6,6 +6,8 @@
 #[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
+mod host;
+#[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
 mod wire;
@@ -23,6 +25,8 @@ enum Subject {
     Signals,
     /// What the firmware's ELF costs and bears on the emulated board.
     Emulated,
+    /// Frames per second that the host decodes, tightens and places in time.
+    Host,
 }
 
 /// What `cargo xtask bench` takes.
@@ -57,6 +61,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Wire => wire::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
+            Subject::Host => host::run()?,
         }
     }
     Ok(())

@@ -11,15 +11,17 @@ use cantap_wire::{Channel, Frame, Id, Received};
 /// Frames of each kind.
 const FRAMES: u64 = 1_000_000;
 /// Ticks between two frames at 1 Mbit/s and 12 MHz: 48, 111, 68 and 131 bits, the shortest of their kind.
-const KINDS: [Kind; 4] = [
+pub const KINDS: [Kind; 4] = [
     Kind { name: "std0", extended: false, len: 0, ticks: 48 * 12, budget: 5.5 },
     Kind { name: "std8", extended: false, len: 8, ticks: 111 * 12, budget: 13.5 },
     Kind { name: "ext0", extended: true, len: 0, ticks: 68 * 12, budget: 7.5 },
     Kind { name: "ext8", extended: true, len: 8, ticks: 131 * 12, budget: 15.5 },
 ];
 
-struct Kind {
-    name: &'static str,
+/// A kind of frames.
+pub struct Kind {
+    /// As `cantap demo` calls it.
+    pub name: &'static str,
     extended: bool,
     len: usize,
     ticks: i32,
@@ -33,7 +35,8 @@ pub fn run() -> Result<()> {
     println!("{:<6} {:>12} {:>8} {:>14}", "kind", "bytes/frame", "at most", "encode ns/frame");
     for kind in &KINDS {
         let begin = Instant::now();
-        let bytes = encode(kind);
+        let mut bytes = 0;
+        encode(kind, FRAMES, |batch| bytes += batch.len());
         let nanos = begin.elapsed().as_nanos() as f64 / FRAMES as f64;
         let per_frame = bytes as f64 / FRAMES as f64;
         println!("{:<6} {:>12.2} {:>8.1} {:>14.1}", kind.name, per_frame, kind.budget, nanos);
@@ -42,13 +45,12 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// Encodes [`FRAMES`] frames as the device does and returns the bytes on the wire.
-fn encode(kind: &Kind) -> u64 {
+/// Encodes frames of a kind as the device does, and hands over each batch as it goes over the wire.
+pub fn encode(kind: &Kind, frames: u64, mut batch: impl FnMut(&[u8])) {
     let mut writer = BatchWriter::new();
     let mut out = [0; MAX_ENCODED];
     let mut record = [0; MAX_RECORD];
-    let mut bytes = 0;
-    for number in 0..FRAMES {
+    for number in 0..frames {
         let raw = (number as u32).wrapping_mul(0x9E37_79B9);
         let id = if kind.extended { Id::extended_truncated(raw) } else { Id::standard_truncated(raw) };
         let data = u64::from(raw).wrapping_mul(0x9E37_79B9_7F4A_7C15).to_le_bytes();
@@ -58,9 +60,11 @@ fn encode(kind: &Kind) -> u64 {
         let len = encode_received(&received, kind.ticks, &mut record);
         let base_ticks = number * kind.ticks as u64;
         if !writer.push(&record[..len], base_ticks, Some(channel)) {
-            bytes += writer.finish(&mut out) as u64;
+            let len_out = writer.finish(&mut out);
+            batch(&out[..len_out]);
             writer.push(&record[..len], base_ticks, Some(channel));
         }
     }
-    bytes + writer.finish(&mut out) as u64
+    let len_out = writer.finish(&mut out);
+    batch(&out[..len_out]);
 }

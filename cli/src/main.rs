@@ -11,6 +11,7 @@ mod losses;
 mod meter;
 mod sending;
 mod timing_args;
+mod trigger_args;
 
 use std::process::ExitCode;
 
@@ -40,9 +41,20 @@ struct Cli {
 fn main() -> ExitCode {
     match Cli::parse().command.run() {
         Ok(code) => code,
+        // `cantap … | head` has read what it wanted.
+        Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("cantap: {error:#}");
             ExitCode::from(exit::FAILURE)
         }
     }
+}
+
+/// Whether it only says that nobody reads our output any more.
+fn is_broken_pipe(error: &anyhow::Error) -> bool {
+    let pipe = |cause: &(dyn std::error::Error + 'static)| {
+        let cause = cause.downcast_ref::<std::io::Error>();
+        cause.is_some_and(|cause| cause.kind() == std::io::ErrorKind::BrokenPipe)
+    };
+    error.chain().any(pipe)
 }

@@ -8,12 +8,14 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use cantap::device::Records;
 use cantap::formats::{Format, TraceWriter, WriteOptions, create_writer};
+use cantap::trigger::{Trigger, TriggerCounts};
 use cantap::{Address, Channel, Device, TraceRecord};
 
 use crate::args;
 use crate::interrupt;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
+use crate::trigger_args::TriggerArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -21,7 +23,8 @@ use crate::meter::{Meter, rounded};
                         Without -o the trace goes to standard output, unless --json is given.\n\n\
                         Examples:\n  cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
                         cantap capture -d virtual -b 1M -n 1000\n  \
-                        cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json")]
+                        cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json\n  \
+                        cantap capture -d /dev/ttyACM0 -b 500k --db car.dbc --trigger 'Speed > 80' --pre 2s --post 5s -o fast.log")]
 pub struct Args {
     /// Where the device is: a serial port, or virtual.
     #[arg(short, long)]
@@ -44,6 +47,8 @@ pub struct Args {
     /// Print one JSON object with the summary.
     #[arg(long)]
     json: bool,
+    #[command(flatten)]
+    trigger: TriggerArgs,
 }
 
 /// How long records may stay in memory while others follow slowly.
@@ -67,6 +72,22 @@ struct Summary {
     channels: Vec<ChannelSummary>,
     lost: Losses,
     clock_drift_ppm: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    trigger: Option<TriggerSummary>,
+}
+
+#[derive(serde::Serialize)]
+struct TriggerSummary {
+    events: u64,
+    kept: u64,
+    forgotten: u64,
+}
+
+impl TriggerSummary {
+    fn of(trigger: &Trigger) -> Self {
+        let TriggerCounts { events, kept, forgotten } = trigger.counts();
+        Self { events, kept, forgotten }
+    }
 }
 
 /// Runs it.
@@ -92,12 +113,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         End::Enough | End::NobodyReads => Ok(device.stop().map(|_| ())?),
     });
+    let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
     let summary = Summary {
         seconds: rounded(seconds, 3),
         channels: args.channel.iter().map(|channel| summarize(channel, &meters)).collect(),
         lost: Losses::of(&device.counters()),
         clock_drift_ppm: device.clock().drift_ppm.map(|ppm| rounded(ppm, 2)),
+        trigger,
     };
     report(args, &summary)?;
     end?;
@@ -133,7 +156,9 @@ fn write_until_asked(
             if !sink.write(record)? {
                 return Ok(End::NobodyReads);
             }
-            if is_enough(args, meters) {
+            if is_enough(args, meters)
+                || sink.trigger.as_ref().is_some_and(|trigger| args.trigger.is_over(trigger))
+            {
                 return Ok(End::Enough);
             }
         }
@@ -186,6 +211,12 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
             "channel {channel}: {frames} frames, {frames_per_s} frames/s, bus load {bus_load_pct} %, {lost} lost"
         );
     }
+    if let Some(TriggerSummary { events, kept, forgotten }) = &summary.trigger {
+        eprintln!("trigger: {events} events, {kept} records kept");
+        if *forgotten > 0 {
+            eprintln!("{forgotten} records before events were too many to remember; use a shorter --pre");
+        }
+    }
     eprintln!("lost: {}", summary.lost.line());
     if let Some(ppm) = summary.clock_drift_ppm {
         eprintln!("the device's clock runs {ppm} ppm faster than this computer's");
@@ -198,14 +229,18 @@ struct Sink {
     writer: Option<Box<dyn TraceWriter>>,
     name: String,
     to_stdout: bool,
+    trigger: Option<Trigger>,
 }
 
 impl Sink {
     fn create(args: &Args) -> anyhow::Result<Self> {
+        let trigger = args.trigger.trigger()?;
         let path = match &args.output {
             Some(path) => path.as_path(),
             // Standard output is for one JSON object then.
-            None if args.json => return Ok(Self { writer: None, name: String::new(), to_stdout: false }),
+            None if args.json => {
+                return Ok(Self { writer: None, name: String::new(), to_stdout: false, trigger });
+            }
             None => Path::new("-"),
         };
         let format = path.extension().is_none().then_some(Format::Candump);
@@ -214,12 +249,17 @@ impl Sink {
         let writer = create_writer(path, &options).with_context(|| {
             format!("cannot write to '{name}'; choose a folder and name that you may write")
         })?;
-        Ok(Self { writer: Some(writer), to_stdout: name == "-", name })
+        Ok(Self { writer: Some(writer), to_stdout: name == "-", name, trigger })
     }
 
-    /// Writes a record. Returns whether anybody still reads.
+    /// Writes a record, if the trigger does not hold it back. Returns whether anybody still reads.
     fn write(&mut self, record: &TraceRecord) -> anyhow::Result<bool> {
-        let result = self.writer.as_mut().map_or(Ok(()), |writer| writer.write(record));
+        let writer = &mut self.writer;
+        let mut write = |record: &TraceRecord| writer.as_mut().map_or(Ok(()), |writer| writer.write(record));
+        let result = match &mut self.trigger {
+            Some(trigger) => trigger.push(record, write),
+            None => write(record),
+        };
         self.judge(result)
     }
 

@@ -1,0 +1,47 @@
+//! Triggers on the command line: keep what happened around events only.
+
+use std::time::Duration;
+
+use anyhow::anyhow;
+use cantap::condition::Condition;
+use cantap::trigger::{Trigger, Window};
+
+use crate::args;
+use crate::databases::DatabaseArgs;
+
+/// When to keep records; for commands to flatten into theirs.
+#[derive(clap::Args)]
+pub struct TriggerArgs {
+    /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123"
+    /// or "error" (see cantap search --help).
+    #[arg(long, value_name = "CONDITION")]
+    trigger: Option<String>,
+    /// Keep also what happened for so long before the condition held.
+    #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
+    pre: Duration,
+    /// Keep also what happens for so long after it held.
+    #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
+    post: Duration,
+    /// End after the first event.
+    #[arg(long, requires = "trigger")]
+    once: bool,
+    #[command(flatten)]
+    databases: DatabaseArgs,
+}
+
+impl TriggerArgs {
+    /// The trigger, if one was asked for.
+    pub fn trigger(&self) -> anyhow::Result<Option<Trigger>> {
+        let Some(text) = &self.trigger else { return Ok(None) };
+        let decoder = self.databases.load(false)?;
+        let condition = Condition::new(text, &decoder).map_err(|error| anyhow!("--trigger: {error}"))?;
+        let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
+        let window = Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post) };
+        Ok(Some(Trigger::new(condition, window)))
+    }
+
+    /// Whether nothing more is wanted.
+    pub fn is_over(&self, trigger: &Trigger) -> bool {
+        self.once && trigger.counts().events > 0 && !trigger.is_open()
+    }
+}

@@ -69,6 +69,34 @@ impl DatabaseArgs {
         Ok(decoder)
     }
 
+    /// Loads what can be loaded, and `further` databases; what is wrong goes to `complaints`. For programs that
+    /// go on without a database.
+    pub fn load_what_can_be(&self, further: &[String], complaints: &mut Vec<String>) -> Decoder {
+        let mut paths = self.databases.clone();
+        for text in further {
+            match text.parse() {
+                Ok(path) => paths.push(path),
+                Err(reason) => complaints.push(format!("database {text}: {reason}")),
+            }
+        }
+        let mut sources = Vec::new();
+        for DatabasePath { channel, path } in paths {
+            match signals::load(&path) {
+                Ok(database) => {
+                    let faults = database.warnings.iter();
+                    complaints.extend(faults.map(|fault| format!("{}: {fault}", database.file)));
+                    sources.push(Source { channel, database });
+                }
+                Err(error) => complaints.push(error.to_string()),
+            }
+        }
+        let mut decoder = Decoder::new(sources);
+        if self.j1939 {
+            decoder.assume_j1939();
+        }
+        decoder
+    }
+
     /// As [`Self::load`], for commands that are useless without a database.
     pub fn load_some(&self, strict: bool, patterns: &[String]) -> anyhow::Result<Decoder> {
         let mut decoder = self.load(strict)?;

@@ -9,6 +9,7 @@ mod interrupt;
 mod live;
 mod losses;
 mod meter;
+mod monitor;
 mod sending;
 mod timing_args;
 mod trigger_args;

@@ -9,6 +9,7 @@ pub mod demo;
 pub mod diff;
 pub mod info;
 pub mod list;
+pub mod monitor;
 pub mod plot;
 pub mod search;
 pub mod send;
@@ -25,6 +26,8 @@ use std::process::ExitCode;
 pub enum Command {
     /// Show a frame's exact length on the bus, stuff bits and CRC.
     Bits(bits::Args),
+    /// Watch a bus or a trace: frames, identifiers, signals, graphs, statistics; send and record.
+    Monitor(monitor::Args),
     /// Draw signals, bus load or periods of a trace: SVG, PNG, HTML, or in the terminal.
     Plot(plot::Args),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
@@ -69,6 +72,7 @@ impl Command {
     pub fn run(self) -> anyhow::Result<ExitCode> {
         match self {
             Self::Bits(args) => bits::run(&args),
+            Self::Monitor(args) => monitor::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Stats(args) => stats::run(&args),
             Self::Diff(args) => diff::run(&args),

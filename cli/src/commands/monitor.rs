@@ -1,0 +1,197 @@
+//! `cantap monitor`: the live view of a device or a file.
+
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use cantap::Address;
+use cantap::filter::Filter;
+use cantap::signals::Decoder;
+use cantap::wire::message::Mode;
+
+use super::stats::ChannelBitrate;
+use crate::args;
+use crate::databases::DatabaseArgs;
+use crate::monitor::app::{App, SendEntry, View, channels_of, parse_entry};
+use crate::monitor::model::Model;
+use crate::monitor::profile::Profile;
+use crate::monitor::source::{Order, Origin, Plan};
+use crate::monitor::theme::Theme;
+use crate::monitor::{once, orders, run as show};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap monitor -d virtual -b 500k\n  \
+    cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
+    cantap monitor trace.blf -b 500k --db car.dbc\n  \
+    cantap monitor -p car.toml\n\n\
+h shows the keys. Without a device and a file, the virtual device is shown.")]
+pub struct Args {
+    /// A trace to play back instead of a device.
+    #[arg(value_name = "FILE", conflicts_with = "device")]
+    file: Option<PathBuf>,
+    /// The device.
+    #[arg(short, long)]
+    device: Option<Address>,
+    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
+    /// repeated.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE")]
+    bitrates: Vec<ChannelBitrate>,
+    /// Take part in the bus: acknowledge, and send on request. Listen-only without it.
+    #[arg(long)]
+    normal: bool,
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// Show only these frames, in candump's syntax. Can be repeated. The recording takes all.
+    #[arg(short, long, value_name = "FILTER")]
+    filter: Vec<Filter>,
+    /// A profile: device, bit rates, databases, filters, view, send list.
+    #[arg(short, long, value_name = "FILE")]
+    profile: Option<PathBuf>,
+    /// The page to begin with: trace, fixed, signals, graph, statistics, send or record.
+    #[arg(long, value_name = "PAGE", value_parser = view)]
+    view: Option<View>,
+    /// Record to this file from the start.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
+    /// Memory for scrolling back, in MB.
+    #[arg(long, value_name = "MB", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=4096))]
+    history: u32,
+    /// Colours for a light background.
+    #[arg(long)]
+    light: bool,
+    /// Print one screen and leave.
+    #[arg(long)]
+    once: bool,
+    /// With --once: look at a device for so long.
+    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    time: Duration,
+    /// With --once: the screen's size.
+    #[arg(long, value_name = "COLUMNSxROWS", default_value = "80x24", value_parser = size)]
+    size: (u16, u16),
+}
+
+fn view(text: &str) -> Result<View, String> {
+    let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
+    found.ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send or record".to_owned())
+}
+
+fn size(text: &str) -> Result<(u16, u16), String> {
+    let parsed =
+        text.split_once('x').and_then(|(columns, rows)| Some((columns.parse().ok()?, rows.parse().ok()?)));
+    parsed
+        .filter(|(columns, rows)| (1..=500).contains(columns) && (1..=300).contains(rows))
+        .ok_or_else(|| "write the size as columns and rows, such as 80x24".to_owned())
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    // What is wrong with profile and databases is shown, and the view opens without it.
+    let mut complaints = Vec::new();
+    let profile = load_profile(args.profile.as_deref(), &mut complaints);
+    let decoder = load_databases(args, &profile, &mut complaints);
+    let rates = bit_rates(args, &profile, &mut complaints);
+    let options = ChannelBitrate::options(&rates);
+    let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
+    model.filters.clone_from(&args.filter);
+    for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
+        match text.parse() {
+            Ok(filter) => model.filters.push(filter),
+            Err(error) => complaints.push(format!("filter {text}: {error}")),
+        }
+    }
+    for name in &profile.graph {
+        model.signals.choose(name);
+    }
+    let (origin, plan) = match &args.file {
+        Some(path) => (Origin::File(path.clone()), None),
+        None => {
+            let plan = plan(args, &profile, &rates, &mut complaints)?;
+            (Origin::Device(plan.clone()), Some(plan))
+        }
+    };
+    let theme = Theme::from_environment(args.light || profile.light);
+    let (sender, receiver) = orders();
+    let mut app = App::new(args.view.or(profile.view).unwrap_or(View::Fixed), theme, plan, sender);
+    app.sort = profile.sort.unwrap_or(app.sort);
+    app.send = send_list(&profile, &model, &mut complaints);
+    if let Some(path) = args.output.clone().or(profile.record.map(PathBuf::from)) {
+        app.orders.send(Order::Record(path))?;
+    }
+    if args.once {
+        for complaint in complaints {
+            eprintln!("cantap: {complaint}");
+        }
+        let text = once(origin, app, model, receiver, args.size, args.time)?;
+        std::io::stdout().lock().write_all(text.as_bytes())?;
+    } else {
+        model.notice = complaints.join("; ");
+        show(origin, app, model, receiver)?;
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {
+    let loaded = path.map(Profile::load).transpose();
+    loaded
+        .unwrap_or_else(|complaint| {
+            complaints.push(complaint);
+            None
+        })
+        .unwrap_or_default()
+}
+
+fn load_databases(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Decoder {
+    let own = if args.databases.is_empty() { profile.databases.as_slice() } else { &[] };
+    args.databases.load_what_can_be(own, complaints)
+}
+
+fn bit_rates(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<ChannelBitrate> {
+    if !args.bitrates.is_empty() {
+        return args.bitrates.clone();
+    }
+    let mut rates = Vec::new();
+    for text in &profile.bitrates {
+        match text.parse() {
+            Ok(rate) => rates.push(rate),
+            Err(reason) => complaints.push(format!("bit rate {text}: {reason}")),
+        }
+    }
+    rates
+}
+
+fn plan(
+    args: &Args,
+    profile: &Profile,
+    rates: &[ChannelBitrate],
+    complaints: &mut Vec<String>,
+) -> anyhow::Result<Plan> {
+    let address = match (&args.device, &profile.device) {
+        (Some(address), _) => address.clone(),
+        (None, Some(text)) => text.parse().unwrap_or_else(|error| {
+            complaints.push(format!("device {text}: {error}"));
+            Address::Virtual(String::new())
+        }),
+        (None, None) => Address::Virtual(String::new()),
+    };
+    let mode = if args.normal || profile.normal { Mode::Normal } else { Mode::ListenOnly };
+    Ok(Plan {
+        address,
+        channels: channels_of(rates).map_err(|reason| anyhow::anyhow!("{reason} (-b)"))?,
+        mode,
+    })
+}
+
+fn send_list(profile: &Profile, model: &Model, complaints: &mut Vec<String>) -> Vec<SendEntry> {
+    let mut entries = Vec::new();
+    for text in &profile.send {
+        match parse_entry(text, model) {
+            Ok(entry) => entries.push(entry),
+            Err(reason) => complaints.push(format!("to send, {text}: {reason}")),
+        }
+    }
+    entries
+}

@@ -1,0 +1,42 @@
+//! All keys.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::text::Line;
+use ratatui::widgets::{Block, Clear, Paragraph};
+
+use super::super::app::App;
+
+const KEYS: [(&str, &str); 19] = [
+    ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send, record"),
+    ("q, Ctrl-C", "leave"),
+    ("Space", "stop and go on with the display (send page: an entry on or off)"),
+    ("c", "clear"),
+    ("t", "times: relative, delta, absolute"),
+    ("f", "show only some frames, by filters in candump's syntax"),
+    ("/  n  N", "trace: search, next older, next newer"),
+    ("y", "trace: copy the selected frame"),
+    ("arrows, Pg, End", "scroll; End is the newest"),
+    ("s  S  g", "fixed: sort by the next column, reverse, group by channel"),
+    ("#  *  H", "fixed: hide what changes anyway, show it again, heat of bits"),
+    ("x  u  o", "fixed: hide the row, show all, colour the row"),
+    ("Enter", "signals: into the graph; send: send once"),
+    ("+ -, arrows", "graph: zoom, cursor"),
+    ("a  e  d", "send: add, edit, delete"),
+    ("m", "listen-only or normal"),
+    ("r", "start or stop recording"),
+    ("b  D", "bit rates, device"),
+    (",  .  p  >  l", "file: slower, faster, stop, one frame, loop"),
+];
+
+/// Draws the help over the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &App) {
+    let width = area.width.min(92);
+    let height = area.height.min(KEYS.len() as u16 + 2);
+    let place =
+        Rect { x: area.x + (area.width - width) / 2, y: area.y + (area.height - height) / 2, width, height };
+    let lines: Vec<_> = KEYS.iter().map(|(keys, what)| Line::from(format!(" {keys:<15} {what}"))).collect();
+    frame.render_widget(Clear, place);
+    let block = Block::bordered().title(" Keys, any key closes ").title_style(app.theme.heading());
+    frame.render_widget(Paragraph::new(lines).block(block), place);
+}

@@ -1,0 +1,31 @@
+//! The recording that runs, if one does.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::text::Line;
+use ratatui::widgets::Paragraph;
+
+use super::super::app::App;
+use super::super::model::Model;
+
+/// Draws the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+    let lines = match &model.recording {
+        None => vec![
+            Line::from("Nothing is recorded. r starts: the file's suffix chooses the format."),
+            Line::from("Everything that comes is recorded, whatever is shown, paused or filtered here."),
+        ],
+        Some(recording) => {
+            let seconds = model.now_ns().saturating_sub(recording.since_ns) as f64 / 1e9;
+            let seconds = if recording.records == 0 { 0.0 } else { seconds.max(0.0) };
+            vec![
+                Line::from(format!("Recording to {}", recording.path)).style(app.theme.error()),
+                Line::from(format!("Records   {}", recording.records)),
+                Line::from(format!("Size      {}", super::bytes(recording.bytes))),
+                Line::from(format!("Time      {seconds:.1} s")),
+                Line::from("r stops."),
+            ]
+        }
+    };
+    frame.render_widget(Paragraph::new(lines), area);
+}

@@ -1,0 +1,48 @@
+//! Frames to send, once or periodically.
+
+use ratatui::Frame;
+use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::text::Line;
+use ratatui::widgets::Paragraph;
+
+use super::super::app::App;
+use super::super::model::Model;
+
+/// Draws the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+    let [state, body] = Layout::vertical([Constraint::Length(1), Constraint::Min(1)]).areas(area);
+    let (text, style) = match &app.plan {
+        None => ("A file sends nothing. Open a device with D.", app.theme.label()),
+        Some(plan) if plan.mode.transmits() => {
+            ("Normal mode: what is sent here goes onto the bus.", app.theme.loss())
+        }
+        Some(_) => (
+            "Listen-only: nothing is sent, not even an acknowledge. m takes part in the bus.",
+            app.theme.label(),
+        ),
+    };
+    frame.render_widget(Paragraph::new(Line::styled(text, style)), state);
+    if app.send.is_empty() {
+        let database = if model.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
+        let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");
+        frame.render_widget(Paragraph::new(text), body);
+        return;
+    }
+    let heading = Line::from(format!("   C {:<24} {:>10} {:>8}  As typed", "Frame", "Period", "By key"));
+    let lines: Vec<_> = app
+        .send
+        .iter()
+        .map(|entry| {
+            let period = entry.period.map_or("once".to_owned(), |period| format!("{period:?}"));
+            format!(
+                "{} {} {:<24} {period:>10} {:>8}  {}",
+                if entry.on { "on" } else { "  " },
+                entry.channel.number(),
+                entry.frame.to_string(),
+                entry.sent,
+                entry.text
+            )
+        })
+        .collect();
+    super::list(frame, body, app, heading, lines.len(), |index, _| Line::from(lines[index].clone()));
+}

@@ -1,0 +1,87 @@
+//! Live values of decoded signals, with extremes, alarms and the recent past.
+
+use cantap::signals::Alarm;
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::Style;
+use ratatui::text::{Line, Span};
+use ratatui::widgets::Paragraph;
+
+use super::super::app::App;
+use super::super::model::{Model, SignalRow};
+
+/// Columns of the small curve.
+const SPARK_COLUMNS: usize = 16;
+
+/// Draws the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+    let rows = model.signals.rows();
+    if rows.is_empty() {
+        let text = if model.signals.has_database() {
+            "No frame of the databases was seen yet."
+        } else {
+            "There is no signal database. Start with --db FILE, a DBC file or a .toml signal file."
+        };
+        frame.render_widget(Paragraph::new(text), area);
+        return;
+    }
+    let width = usize::from(area.width);
+    let name_columns = width.saturating_sub(2 + 2 + 22 + 10 + 10 + SPARK_COLUMNS + 5).clamp(12, 48);
+    let heading = Line::from(format!(
+        "  C {:<name_columns$} {:>22} {:>10} {:>10} Past",
+        "Signal", "Value", "Min", "Max"
+    ));
+    super::list(frame, area, app, heading, rows.len(), |index, app| {
+        line(&rows[index], name_columns, app, model)
+    });
+}
+
+fn line(row: &SignalRow, name_columns: usize, app: &App, model: &Model) -> Line<'static> {
+    let theme = app.theme;
+    let signal = model.signals.signal(row);
+    let (arrow, style) = match model.signals.alarm(row) {
+        Some(Alarm::Above) => (if theme.unicode { "▲" } else { "^" }, theme.error()),
+        Some(Alarm::Below) => (if theme.unicode { "▼" } else { "v" }, theme.below()),
+        None => (" ", Style::new()),
+    };
+    let full = format!("{}.{}", model.signals.message_name(row), signal.name);
+    let name = if full.chars().count() > name_columns { signal.name.clone() } else { full };
+    let name: String = name.chars().take(name_columns).collect();
+    let value: String = model.signals.text(row).chars().take(22).collect();
+    Line::from(vec![
+        Span::raw(if row.chosen { "* " } else { "  " }),
+        Span::raw(format!("{} {name:<name_columns$} ", row.channel)),
+        Span::styled(format!("{value:>21}{arrow}"), style),
+        Span::styled(format!(" {:>10} {:>10} ", short(row.min), short(row.max)), theme.label()),
+        Span::styled(spark(row, theme.unicode), theme.series(0)),
+    ])
+}
+
+/// A value in at most ten columns.
+pub fn short(value: f64) -> String {
+    let text = format!("{value}");
+    if text.len() <= 10 {
+        return text;
+    }
+    let rounded = format!("{value:.3}");
+    if rounded.len() <= 10 { rounded } else { format!("{value:.3e}") }
+}
+
+/// The last samples as a row of blocks, from their lowest to their highest.
+fn spark(row: &SignalRow, unicode: bool) -> String {
+    let levels: &[char] = if unicode {
+        &['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█']
+    } else {
+        &['_', '.', '-', '=', '*', '#']
+    };
+    let first = row.samples.len().saturating_sub(SPARK_COLUMNS);
+    let samples = || row.samples.iter().skip(first);
+    let low = samples().map(|sample| sample.min).fold(f64::INFINITY, f64::min);
+    let high = samples().map(|sample| sample.max).fold(f64::NEG_INFINITY, f64::max);
+    samples()
+        .map(|sample| {
+            let share = if high > low { (sample.last - low) / (high - low) } else { 0.0 };
+            levels[((share * (levels.len() - 1) as f64).round() as usize).min(levels.len() - 1)]
+        })
+        .collect()
+}

@@ -1,0 +1,183 @@
+//! Load with its history, rates, errors, losses per stage, and how the device is.
+
+use cantap::stats::ChannelStatistics;
+use cantap::wire::record::{BusErrorKind, LossStage};
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::text::{Line, Span};
+use ratatui::widgets::Paragraph;
+
+use super::super::app::App;
+use super::super::model::{DeviceFigures, Model};
+use super::trace::{error_name, state_name};
+
+/// Columns of the gauge on a narrow and on a wide screen.
+const GAUGE_COLUMNS: [usize; 2] = [12, 40];
+
+const KINDS: [BusErrorKind; 6] = [
+    BusErrorKind::Stuff,
+    BusErrorKind::Form,
+    BusErrorKind::Acknowledgment,
+    BusErrorKind::BitRecessive,
+    BusErrorKind::BitDominant,
+    BusErrorKind::Crc,
+];
+
+/// Draws the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+    let mut lines = Vec::new();
+    let width = usize::from(area.width);
+    let mut channels: Vec<_> = model.statistics.channels().iter().collect();
+    channels.sort_by_key(|channel| channel.number);
+    for channel in channels {
+        channel_lines(channel, width, app, model, &mut lines);
+        lines.push(Line::default());
+    }
+    if lines.is_empty() {
+        lines.push(Line::from("Nothing was received yet."));
+        lines.push(Line::default());
+    }
+    if let Some(device) = &model.device {
+        device_lines(device, app, &mut lines);
+    }
+    let (used, most) = model.history.memory();
+    lines.push(Line::from(format!(
+        "History   {} records, {} of {}",
+        model.history.end() - model.history.first(),
+        super::bytes(used as u64),
+        super::bytes(most as u64)
+    )));
+    lines.push(Line::from(format!("Taken     {} records", model.taken)));
+    app.page_rows = usize::from(area.height);
+    // Scrolled with the arrows where the screen is small.
+    let most = lines.len().saturating_sub(app.page_rows);
+    app.selected = app.selected.min(most);
+    let first = app.selected;
+    frame.render_widget(Paragraph::new(lines.split_off(first)), area);
+}
+
+fn channel_lines(
+    channel: &ChannelStatistics,
+    width: usize,
+    app: &App,
+    model: &Model,
+    lines: &mut Vec<Line<'static>>,
+) {
+    let theme = app.theme;
+    let rate = channel.bitrate_bps.map_or("bit rate unknown (-b)".to_owned(), |rate| format!("{rate} bit/s"));
+    let state = channel.state.map_or(String::new(), |state| format!(", {}", state_name(state)));
+    let counters = channel.counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"));
+    lines.push(
+        Line::from(format!("Channel {}: {rate}{state}{counters}", channel.number)).style(theme.heading()),
+    );
+    let windows =
+        model.loads.iter().find(|(number, _)| *number == channel.number).map(|(_, windows)| windows);
+    let latest = windows.and_then(|windows| windows.back());
+    if let Some(load) = latest.and_then(|window| window.load_pct) {
+        lines.push(gauge(load, GAUGE_COLUMNS[usize::from(width >= 110)], channel, app));
+    }
+    let (frames_per_s, bits_per_s) =
+        latest.map_or((0.0, 0.0), |window| (window.frames_per_s(), window.bits_per_s()));
+    lines.push(Line::from(format!(
+        "Frames    {:>10}   {frames_per_s:.0} frames/s, {bits_per_s:.0} bit/s; {} IDs",
+        channel.frames,
+        channel.id_count()
+    )));
+    let kinds = KINDS.into_iter().filter_map(|kind| {
+        let count = channel.errors.of(kind);
+        (count > 0).then(|| format!("{count} {}", error_name(kind)))
+    });
+    let kinds: Vec<_> = kinds.collect();
+    let errors = channel.errors.total();
+    let style = if errors > 0 { theme.error() } else { theme.label() };
+    lines.push(Line::styled(format!("Errors    {errors:>10}   {}", kinds.join(", ")), style));
+    let losses = &channel.losses;
+    let stages = [
+        (LossStage::Controller, "controller"),
+        (LossStage::Queue, "queue"),
+        (LossStage::Link, "link"),
+        (LossStage::Host, "host"),
+    ];
+    let stages: Vec<_> = stages.iter().map(|(stage, name)| format!("{name} {}", losses.of(*stage))).collect();
+    let style = if losses.total() > 0 { theme.loss() } else { theme.label() };
+    let least = if losses.at_least { " at least" } else { "" };
+    lines.push(Line::styled(
+        format!("Lost      {:>10}{least}   {}", losses.total(), stages.join(", ")),
+        style,
+    ));
+    if let Some(windows) = windows.filter(|windows| windows.iter().any(|window| window.load_pct.is_some())) {
+        let columns = width.saturating_sub(11).max(1);
+        let first = windows.len().saturating_sub(columns);
+        let levels: &[char] = if theme.unicode {
+            &[' ', '▁', '▂', '▃', '▄', '▅', '▆', '▇', '█']
+        } else {
+            &[' ', '.', ':', '-', '=', '+', '*', '#', '@']
+        };
+        let bars: String = windows
+            .iter()
+            .skip(first)
+            .map(|window| levels[((window.load_pct.unwrap_or(0.0) * 8.0 / 100.0).round() as usize).min(8)])
+            .collect();
+        lines.push(Line::from(vec![Span::raw("History   "), Span::styled(bars, theme.series(0))]));
+    }
+}
+
+/// A bar of the load, with the instant, mean and peak as figures.
+fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> Line<'static> {
+    let (full, empty) = if app.theme.unicode { ('█', '░') } else { ('#', '.') };
+    let filled = ((load * columns as f64 / 100.0).round() as usize).min(columns);
+    let bar: String = (0..columns).map(|column| if column < filled { full } else { empty }).collect();
+    let percent = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1} %"));
+    let work = channel.load.as_ref();
+    let peak = channel.window_extremes_pct().map(|(_, _, max)| max);
+    let bound = if channel.losses.total() > 0 { " (lower bound)" } else { "" };
+    Line::from(vec![
+        Span::raw("Load      "),
+        Span::styled(bar, app.theme.load(load)),
+        Span::raw(format!(
+            " {load:.1} %{bound}  instant {}  mean {}  peak {}",
+            percent(work.and_then(cantap::stats::WorkLoad::instant_pct)),
+            percent(work.and_then(cantap::stats::WorkLoad::mean_pct)),
+            percent(peak)
+        )),
+    ])
+}
+
+fn device_lines(device: &DeviceFigures, app: &App, lines: &mut Vec<Line<'static>>) {
+    lines.push(Line::from(format!("Device {}", device.name)).style(app.theme.heading()));
+    let delivered: u64 = device.counters.channels.iter().map(|channel| channel.received).sum();
+    if let Some(status) = &device.status {
+        let share = |bytes: u32| f64::from(bytes) * 100.0 / f64::from(device.queue_bytes.max(1));
+        lines.push(Line::from(format!(
+            "Queue     {:.1} % of {} kB now, at most {:.1} %",
+            share(status.queue_bytes),
+            device.queue_bytes / 1024,
+            share(status.queue_high_water_bytes)
+        )));
+        for (number, channel) in (1..).zip(&status.channels) {
+            if channel.open.is_some() {
+                lines.push(Line::from(format!(
+                    "Bus {number}     {}, counters {} / {}, sent {}, failed {}, waiting {}",
+                    state_name(channel.state),
+                    channel.tec,
+                    channel.rec,
+                    channel.transmitted,
+                    channel.transmit_failures,
+                    channel.tx_pending
+                )));
+            }
+        }
+    }
+    let per_frame = device.counters.bytes as f64 / delivered.max(1) as f64;
+    lines.push(Line::from(format!(
+        "Wire      {per_frame:.2} bytes/frame, {} damaged messages, {} reconnects",
+        device.counters.corrupt, device.reconnects
+    )));
+    if let Some(clock) = &device.clock {
+        let drift = clock.drift_ppm.map_or("not known yet".to_owned(), |ppm| format!("{ppm:+.2} ppm"));
+        lines.push(Line::from(format!(
+            "Clock     drift {drift}, round trip {} µs",
+            clock.round_trip_ns / 1000
+        )));
+    }
+}

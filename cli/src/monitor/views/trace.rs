@@ -1,0 +1,211 @@
+//! Every record in order, scrolling back through the history.
+
+use std::fmt::Write as _;
+
+use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap::{TraceEvent, TraceRecord};
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::Style;
+use ratatui::text::{Line, Span};
+use ratatui::widgets::Paragraph;
+
+use super::super::app::{App, TimeMode};
+use super::super::model::Model;
+
+/// Which way to look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// To older records.
+    Back,
+    /// To newer records.
+    Forward,
+}
+
+/// Draws the page.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+    let history = &model.history;
+    let rows = usize::from(area.height).saturating_sub(1) as u64;
+    app.page_rows = rows as usize;
+    let (first, end) = (history.first(), history.end());
+    if let Some(cursor) = app.cursor
+        && cursor < first
+        && end > first
+    {
+        // What was looked at has made room.
+        app.cursor = Some(first);
+    }
+    let bottom = match app.cursor {
+        // In the middle, so that there is something to see on both sides.
+        Some(cursor) => (cursor + rows / 2 + 1).clamp(end.min(first + rows), end),
+        None => end,
+    };
+    let top = bottom.saturating_sub(rows).max(first);
+    let (used, most) = history.memory();
+    let width = usize::from(area.width);
+    let columns =
+        format!("{:>17} C   {:>8} T L {:<23} {:<8} Name", time_heading(app.time_mode), "ID", "Data", "ASCII");
+    let memory = format!("{} of {}", super::bytes(used as u64), super::bytes(most as u64));
+    let room = width.saturating_sub(columns.chars().count() + memory.chars().count());
+    let heading = if room > 1 { format!("{columns}{:room$}{memory}", "") } else { columns };
+    let mut lines = vec![Line::styled(heading, app.theme.heading())];
+    for number in top..bottom {
+        let Some(record) = history.get(number) else {
+            continue;
+        };
+        let before = number.checked_sub(1).and_then(|number| history.get(number));
+        let line = line(record, before, app, model);
+        lines.push(if app.cursor == Some(number) { line.style(app.theme.bar()) } else { line });
+    }
+    frame.render_widget(Paragraph::new(lines), area);
+}
+
+fn time_heading(mode: TimeMode) -> &'static str {
+    match mode {
+        TimeMode::Absolute => "Time (s, UTC)",
+        TimeMode::Relative => "Time (s)",
+        TimeMode::Delta => "Delta (s)",
+    }
+}
+
+/// A time in seconds with six decimals.
+pub fn seconds(ns: i64) -> String {
+    let sign = if ns < 0 { "-" } else { "" };
+    let us = ns.unsigned_abs() / 1000;
+    format!("{sign}{}.{:06}", us / 1_000_000, us % 1_000_000)
+}
+
+fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &Model) -> Line<'static> {
+    let theme = app.theme;
+    let time = match app.time_mode {
+        TimeMode::Absolute => record.time_ns,
+        TimeMode::Relative => record.time_ns.saturating_sub(model.first_ns.unwrap_or(0)),
+        TimeMode::Delta => {
+            record.time_ns.saturating_sub(before.map_or(record.time_ns, |before| before.time_ns))
+        }
+    };
+    let start = format!("{:>17} {} ", seconds(time), record.channel);
+    let TraceEvent::Frame { frame, direction, late } = record.event else {
+        let (text, style) = event(&record.event, app);
+        return Line::styled(format!("{start}{text}"), style);
+    };
+    let sent = direction == cantap::Direction::Tx;
+    let mut text = format!(
+        "{start}{} {:>8} {} {} {:<23} {:<8} ",
+        if sent { 'T' } else { 'R' },
+        frame.id().to_string(),
+        if frame.is_remote() { 'R' } else { 'D' },
+        frame.dlc(),
+        hex(frame.data()),
+        printable(frame.data()),
+    );
+    text.push_str(model.signals.name_of(record).unwrap_or_default());
+    if late {
+        text.push_str(" (or earlier)");
+    }
+    match before.map(|before| before.event) {
+        Some(TraceEvent::Lost { count, at_least, .. }) => {
+            let least = if at_least { "at least " } else { "" };
+            let _ = write!(text, " {least}{count} lost before");
+            Line::styled(text, theme.loss())
+        }
+        _ => Line::from(Span::styled(text, if sent { theme.sent() } else { Style::new() })),
+    }
+}
+
+/// Bytes as pairs of digits.
+pub fn hex(data: &[u8]) -> String {
+    let mut text = String::with_capacity(24);
+    for (index, byte) in data.iter().enumerate() {
+        // Writing to a String cannot fail.
+        let _ = write!(text, "{}{byte:02X}", if index == 0 { "" } else { " " });
+    }
+    text
+}
+
+/// Bytes as characters, dots for those without one.
+pub fn printable(data: &[u8]) -> String {
+    data.iter().map(|byte| if (0x20..0x7F).contains(byte) { *byte as char } else { '.' }).collect()
+}
+
+/// What a record says that is no frame.
+fn event(event: &TraceEvent, app: &App) -> (String, Style) {
+    let theme = app.theme;
+    let counters = |counters: Option<(u8, u8)>| {
+        counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
+    };
+    match *event {
+        TraceEvent::Frame { .. } => (String::new(), Style::new()),
+        TraceEvent::BusError { kind, counters: at } => {
+            (format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at)), theme.error())
+        }
+        TraceEvent::ErrorsSuppressed { count } => (format!("E {count} more bus errors"), theme.error()),
+        TraceEvent::State { state, counters: at } => {
+            let style = if state == ErrorState::Active { theme.label() } else { theme.error() };
+            (format!("S {}{}", state_name(state), counters(at)), style)
+        }
+        TraceEvent::Lost { stage, count, at_least } => {
+            let least = if at_least { "at least " } else { "" };
+            (format!("L {least}{count} frames lost {}", stage.map_or("somewhere", stage_name)), theme.loss())
+        }
+        TraceEvent::TransmitFailed { tag, reason } => {
+            (format!("F frame {tag} not sent: {reason:?}"), theme.error())
+        }
+    }
+}
+
+/// A kind of error in the words of the field.
+pub fn error_name(kind: BusErrorKind) -> &'static str {
+    match kind {
+        BusErrorKind::Stuff => "stuff",
+        BusErrorKind::Form => "form",
+        BusErrorKind::Acknowledgment => "acknowledgment",
+        BusErrorKind::BitRecessive => "bit (recessive sent)",
+        BusErrorKind::BitDominant => "bit (dominant sent)",
+        BusErrorKind::Crc => "CRC",
+    }
+}
+
+/// A state in the words of the field.
+pub fn state_name(state: ErrorState) -> &'static str {
+    match state {
+        ErrorState::Active => "error active",
+        ErrorState::Warning => "error warning",
+        ErrorState::Passive => "error passive",
+        ErrorState::BusOff => "bus-off",
+    }
+}
+
+fn stage_name(stage: LossStage) -> &'static str {
+    match stage {
+        LossStage::Controller => "in the controller",
+        LossStage::Queue => "in the device's queue",
+        LossStage::Link => "on the way to the host",
+        LossStage::Host => "in the host",
+    }
+}
+
+/// The record as candump writes it.
+pub fn candump_line(model: &Model, number: u64) -> Option<String> {
+    let record = model.history.get(number)?;
+    let frame = record.frame()?;
+    Some(format!("({}) can{} {frame}", seconds(record.time_ns), record.channel.saturating_sub(1)))
+}
+
+/// The next record whose frame or name contains `text` (in capitals), from `cursor` on.
+pub fn find(model: &Model, cursor: Option<u64>, text: &str, direction: Direction) -> Option<u64> {
+    let (first, end) = (model.history.first(), model.history.end());
+    let compact: String = text.chars().filter(|character| !character.is_whitespace()).collect();
+    let matches = |number: &u64| {
+        let Some(record) = model.history.get(*number) else {
+            return false;
+        };
+        record.frame().is_some_and(|frame| frame.to_string().contains(&compact))
+            || model.signals.name_of(record).is_some_and(|name| name.to_uppercase().contains(text))
+    };
+    let from = cursor.unwrap_or(end);
+    match direction {
+        Direction::Back => (first..from.min(end)).rev().find(matches),
+        Direction::Forward => (from.saturating_add(1).max(first)..end).find(matches),
+    }
+}

@@ -106,12 +106,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for name in &profile.graph {
         model.signals.choose(name);
     }
-    let (origin, plan) = match &args.file {
-        Some(path) => (Origin::File(path.clone()), None),
-        None => {
-            let plan = plan(args, &profile, &rates, &mut complaints)?;
-            (Origin::Device(plan.clone()), Some(plan))
-        }
+    let (origin, plan) = if let Some(path) = &args.file {
+        (Origin::File(path.clone()), None)
+    } else {
+        let plan = plan(args, &profile, &rates, &mut complaints)?;
+        (Origin::Device(plan.clone()), Some(plan))
     };
     let theme = Theme::from_environment(args.light || profile.light);
     let (sender, receiver) = orders();

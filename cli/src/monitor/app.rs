@@ -321,7 +321,7 @@ impl App {
             }
             (View::Signals, KeyCode::Enter) => model.signals.toggle(self.selected),
             (View::Graph, KeyCode::Char('+') | KeyCode::Up) => {
-                self.graph_span = (self.graph_span / 2.0).max(0.1)
+                self.graph_span = (self.graph_span / 2.0).max(0.1);
             }
             (View::Graph, KeyCode::Char('-') | KeyCode::Down) => {
                 self.graph_span = (self.graph_span * 2.0).min(600.0);
@@ -431,12 +431,11 @@ impl App {
                 Ok(())
             }
             PromptKind::Filter => self.set_filters(text),
-            PromptKind::Record if text.is_empty() => Ok(()),
+            PromptKind::Record | PromptKind::Send if text.is_empty() => Ok(()),
             PromptKind::Record => {
                 self.order(Order::Record(PathBuf::from(text)));
                 Ok(())
             }
-            PromptKind::Send if text.is_empty() => Ok(()),
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
@@ -461,7 +460,7 @@ impl App {
         };
         let rates = text
             .split_whitespace()
-            .map(|part| part.parse::<crate::commands::stats::ChannelBitrate>())
+            .map(str::parse::<crate::commands::stats::ChannelBitrate>)
             .collect::<Result<Vec<_>, _>>()?;
         let plan = Plan { channels: channels_of(&rates)?, ..plan.clone() };
         self.open(plan, model)
@@ -469,19 +468,18 @@ impl App {
 
     fn set_device(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
         let address: Address = text.parse().map_err(|error: cantap::DeviceError| error.to_string())?;
-        let plan = match &self.plan {
-            Some(plan) => Plan { address, ..plan.clone() },
-            None => {
-                let options = model.options();
-                let channels = Channel::ALL
-                    .into_iter()
-                    .filter_map(|channel| Some((channel, options.bitrate_of(channel.number())?)))
-                    .collect::<Vec<_>>();
-                if channels.is_empty() {
-                    return Err("no bit rate is known; leave, and start with -d DEVICE -b BITRATE".to_owned());
-                }
-                Plan { address, channels, mode: Mode::ListenOnly }
+        let plan = if let Some(plan) = &self.plan {
+            Plan { address, ..plan.clone() }
+        } else {
+            let options = model.options();
+            let channels: Vec<_> = Channel::ALL
+                .into_iter()
+                .filter_map(|channel| Some((channel, options.bitrate_of(channel.number())?)))
+                .collect();
+            if channels.is_empty() {
+                return Err("no bit rate is known; leave, and start with -d DEVICE -b BITRATE".to_owned());
             }
+            Plan { address, channels, mode: Mode::ListenOnly }
         };
         self.open(plan, model)
     }

@@ -379,6 +379,6 @@ fn periodic(tick_hz: u32, frame: Frame, period: Duration) -> Periodic {
         frame,
         period_ticks: u32::try_from(ticks).unwrap_or(u32::MAX),
         count: 0,
-        modifiers: Default::default(),
+        modifiers: heapless::Vec::new(),
     }
 }

@@ -64,23 +64,25 @@ impl Theme {
     }
 
     /// Headings.
-    pub fn heading(self) -> Style {
+    pub fn heading() -> Style {
         Style::new().add_modifier(Modifier::BOLD)
     }
 
     /// The upper and lower line of the screen, and what is selected.
-    pub fn bar(self) -> Style {
+    pub fn bar() -> Style {
         Style::new().add_modifier(Modifier::REVERSED)
     }
 
     /// A byte that changed so long ago, in nanoseconds: it fades.
     pub fn changed(self, age_ns: i64) -> Style {
         match age_ns {
-            ..300_000_000 => self
+            i64::MIN..300_000_000 => self
                 .style(Color::LightYellow, Color::Rgb(0xA0, 0x40, 0), Modifier::REVERSED)
                 .add_modifier(Modifier::BOLD),
-            ..1_000_000_000 => self.style(Color::Yellow, Color::Rgb(0xB0, 0x60, 0x20), Modifier::BOLD),
-            ..3_000_000_000 => {
+            300_000_000..1_000_000_000 => {
+                self.style(Color::Yellow, Color::Rgb(0xB0, 0x60, 0x20), Modifier::BOLD)
+            }
+            1_000_000_000..3_000_000_000 => {
                 self.style(Color::Rgb(0xA0, 0x90, 0x50), Color::Rgb(0xC0, 0x90, 0x60), Modifier::UNDERLINED)
             }
             _ => Style::new(),

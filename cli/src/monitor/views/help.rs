@@ -5,7 +5,7 @@ use ratatui::layout::Rect;
 use ratatui::text::Line;
 use ratatui::widgets::{Block, Clear, Paragraph};
 
-use super::super::app::App;
+use super::super::theme::Theme;
 
 const KEYS: [(&str, &str); 19] = [
     ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send, record"),
@@ -30,13 +30,13 @@ const KEYS: [(&str, &str); 19] = [
 ];
 
 /// Draws the help over the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &App) {
+pub fn draw(frame: &mut Frame<'_>, area: Rect) {
     let width = area.width.min(92);
     let height = area.height.min(KEYS.len() as u16 + 2);
     let place =
         Rect { x: area.x + (area.width - width) / 2, y: area.y + (area.height - height) / 2, width, height };
     let lines: Vec<_> = KEYS.iter().map(|(keys, what)| Line::from(format!(" {keys:<15} {what}"))).collect();
     frame.render_widget(Clear, place);
-    let block = Block::bordered().title(" Keys, any key closes ").title_style(app.theme.heading());
+    let block = Block::bordered().title(" Keys, any key closes ").title_style(Theme::heading());
     frame.render_widget(Paragraph::new(lines).block(block), place);
 }

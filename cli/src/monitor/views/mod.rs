@@ -16,6 +16,7 @@ use ratatui::widgets::Paragraph;
 
 use super::app::{App, PromptKind, View, source_text};
 use super::model::{Model, SourceState};
+use super::theme::Theme;
 
 /// The smallest screen that anything fits on.
 pub const LEAST: (u16, u16) = (40, 8);
@@ -35,7 +36,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         Constraint::Length(1),
     ])
     .areas(area);
-    frame.render_widget(Paragraph::new(tabs(app)).style(app.theme.bar()), top);
+    frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
     frame.render_widget(Paragraph::new(state_line(app, model)), state);
     match app.view {
         View::Trace => trace::draw(frame, body, app, model),
@@ -46,9 +47,9 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         View::Send => send::draw(frame, body, app, model),
         View::Record => record::draw(frame, body, app, model),
     }
-    frame.render_widget(Paragraph::new(bottom_line(app, model)).style(app.theme.bar()), bottom);
+    frame.render_widget(Paragraph::new(bottom_line(app, model)).style(Theme::bar()), bottom);
     if app.help {
-        help::draw(frame, area, app);
+        help::draw(frame, area);
     }
 }
 
@@ -57,7 +58,7 @@ fn tabs(app: &App) -> Line<'static> {
     for (index, view) in View::ALL.into_iter().enumerate() {
         let text = format!("{}{}{} ", index + 1, if view == app.view { '▸' } else { ' ' }, view.title());
         let text = if app.theme.unicode { text } else { text.replace('▸', ">") };
-        let style = if view == app.view { app.theme.heading() } else { ratatui::style::Style::new() };
+        let style = if view == app.view { Theme::heading() } else { ratatui::style::Style::new() };
         spans.push(Span::styled(text, style));
     }
     Line::from(spans)
@@ -98,10 +99,10 @@ fn state_line(app: &App, model: &Model) -> Line<'static> {
         spans.push(Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()));
     }
     if app.paused {
-        spans.push(Span::styled("  PAUSED", theme.heading()));
+        spans.push(Span::styled("  PAUSED", Theme::heading()));
     }
     if !model.filters.is_empty() {
-        spans.push(Span::styled("  FILTER", theme.heading()));
+        spans.push(Span::styled("  FILTER", Theme::heading()));
     }
     Line::from(spans)
 }
@@ -150,9 +151,9 @@ fn ascii(text: &str) -> String {
 /// A number of bytes for people.
 pub fn bytes(bytes: u64) -> String {
     match bytes {
-        ..10_000 => format!("{bytes} B"),
-        ..10_000_000 => format!("{} kB", bytes / 1000),
-        ..10_000_000_000 => format!("{} MB", bytes / 1_000_000),
+        0..10_000 => format!("{bytes} B"),
+        10_000..10_000_000 => format!("{} kB", bytes / 1000),
+        10_000_000..10_000_000_000 => format!("{} MB", bytes / 1_000_000),
         _ => format!("{} GB", bytes / 1_000_000_000),
     }
 }
@@ -175,10 +176,10 @@ fn list(
     app.page_rows = rows;
     app.selected = app.selected.min(count.saturating_sub(1));
     let first = first_row(app.selected, rows);
-    let mut lines = vec![heading.style(app.theme.heading())];
+    let mut lines = vec![heading.style(Theme::heading())];
     for index in first..count.min(first + rows) {
         let line = row(index, app);
-        lines.push(if index == app.selected { line.style(app.theme.bar()) } else { line });
+        lines.push(if index == app.selected { line.style(Theme::bar()) } else { line });
     }
     frame.render_widget(Paragraph::new(lines), area);
 }

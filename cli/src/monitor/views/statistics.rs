@@ -9,6 +9,7 @@ use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
 use super::super::model::{DeviceFigures, Model};
+use super::super::theme::Theme;
 use super::trace::{error_name, state_name};
 
 /// Columns of the gauge on a narrow and on a wide screen.
@@ -38,7 +39,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         lines.push(Line::default());
     }
     if let Some(device) = &model.device {
-        device_lines(device, app, &mut lines);
+        device_lines(device, &mut lines);
     }
     let (used, most) = model.history.memory();
     lines.push(Line::from(format!(
@@ -68,7 +69,7 @@ fn channel_lines(
     let state = channel.state.map_or(String::new(), |state| format!(", {}", state_name(state)));
     let counters = channel.counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"));
     lines.push(
-        Line::from(format!("Channel {}: {rate}{state}{counters}", channel.number)).style(theme.heading()),
+        Line::from(format!("Channel {}: {rate}{state}{counters}", channel.number)).style(Theme::heading()),
     );
     let windows =
         model.loads.iter().find(|(number, _)| *number == channel.number).map(|(_, windows)| windows);
@@ -143,8 +144,8 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
     ])
 }
 
-fn device_lines(device: &DeviceFigures, app: &App, lines: &mut Vec<Line<'static>>) {
-    lines.push(Line::from(format!("Device {}", device.name)).style(app.theme.heading()));
+fn device_lines(device: &DeviceFigures, lines: &mut Vec<Line<'static>>) {
+    lines.push(Line::from(format!("Device {}", device.name)).style(Theme::heading()));
     let delivered: u64 = device.counters.channels.iter().map(|channel| channel.received).sum();
     if let Some(status) = &device.status {
         let share = |bytes: u32| f64::from(bytes) * 100.0 / f64::from(device.queue_bytes.max(1));

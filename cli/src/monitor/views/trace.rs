@@ -12,6 +12,7 @@ use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, TimeMode};
 use super::super::model::Model;
+use super::super::theme::Theme;
 
 /// Which way to look.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -48,14 +49,14 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let memory = format!("{} of {}", super::bytes(used as u64), super::bytes(most as u64));
     let room = width.saturating_sub(columns.chars().count() + memory.chars().count());
     let heading = if room > 1 { format!("{columns}{:room$}{memory}", "") } else { columns };
-    let mut lines = vec![Line::styled(heading, app.theme.heading())];
+    let mut lines = vec![Line::styled(heading, Theme::heading())];
     for number in top..bottom {
         let Some(record) = history.get(number) else {
             continue;
         };
         let before = number.checked_sub(1).and_then(|number| history.get(number));
         let line = line(record, before, app, model);
-        lines.push(if app.cursor == Some(number) { line.style(app.theme.bar()) } else { line });
+        lines.push(if app.cursor == Some(number) { line.style(Theme::bar()) } else { line });
     }
     frame.render_widget(Paragraph::new(lines), area);
 }

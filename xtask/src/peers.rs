@@ -44,6 +44,12 @@ impl Peers {
         let imports = format!("import {}", imports.join(", "));
         if cmd!(shell, "{python} -c {imports}").quiet().ignore_stderr().run().is_err() {
             let packages = MODULES.map(|(package, _)| package);
+            // Debian has what a venv needs in a package of its own.
+            if cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_err()
+                && toolchain::can_install()
+            {
+                toolchain::install(shell, &["python3-venv"])?;
+            }
             cmd!(shell, "python3 -m venv --clear {venv}").run()?;
             cmd!(shell, "{python} -m pip install --quiet {packages...}").run()?;
         }

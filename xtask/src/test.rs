@@ -37,6 +37,8 @@ enum Step {
     Host,
     /// The tests that run the firmware ELF on the emulated board.
     Emulated,
+    /// The command that a newcomer runs first: both channels at full load, nothing lost.
+    Demo,
     /// Public items' documentation, with every link checked.
     Doc,
 }
@@ -89,6 +91,7 @@ impl Step {
                 let test = cmd!(shell, "cargo test --locked -p cantap-sim --all-features");
                 with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
             }
+            Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
             Step::Doc => {
                 cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
                     .env("RUSTDOCFLAGS", "-D warnings")

@@ -5,6 +5,7 @@
 //! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
 //! here looks at the host's clock, so the same seed gives the same run, byte for byte.
 
+pub mod address;
 pub mod bus;
 pub mod can;
 pub mod capture;

@@ -13,10 +13,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::CYCLES_PER_SECOND;
+use crate::bus::BitTime;
 use crate::elf::Image;
 use crate::machine::Setup;
 use crate::rig::{MS, Rig, RigError};
-use crate::run::Options;
+use crate::run::{DEFAULT_BITRATE_BPS, Options};
+use crate::traffic::Script;
+use cantap_wire::{CHANNELS, Channel};
 
 /// What happens while the client does not read.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -55,22 +58,46 @@ impl Client for crate::pty::Pty {
     }
 }
 
-/// An emulated device with its port open, and traffic on its buses.
+/// An emulated device with its port open, and traffic on the buses of its open channels.
 pub struct Served {
     rig: Rig,
     pace: Pace,
+    options: Options,
+    /// Cycles of a bit of each channel that is open.
+    open: [Option<u64>; CHANNELS],
     waiting: VecDeque<u8>,
 }
 
 impl Served {
-    /// Boots the firmware, enumerates the device and opens its port. Traffic of `options` runs from then on without
-    /// end, or as long as what is replayed.
-    pub fn start(image: Image, options: &Options, pace: Pace) -> Result<Self, RigError> {
+    /// Boots the firmware, enumerates the device and opens its port. A channel's bus carries the traffic of
+    /// `options` as long as the channel is open.
+    pub fn start(image: Image, options: Options, pace: Pace) -> Result<Self, RigError> {
         let mut rig = Rig::new(image, Setup::default(), options.timing);
         rig.plug_in()?;
-        let from = rig.now();
-        crate::run::add_traffic(&mut rig, options, from, u64::MAX);
-        Ok(Self { rig, pace, waiting: VecDeque::new() })
+        for channel in Channel::ALL {
+            let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
+            rig.add_traffic(channel, bitrate_bps, Script::new(Vec::new()));
+        }
+        Ok(Self { rig, pace, options, open: [None; CHANNELS], waiting: VecDeque::new() })
+    }
+
+    /// Starts and ends the traffic of channels that were opened and closed.
+    fn follow_channels(&mut self) {
+        for channel in Channel::ALL {
+            let bit = self.rig.bit_cycles(channel);
+            if bit == self.open[channel.index()] {
+                continue;
+            }
+            self.open[channel.index()] = bit;
+            let bus_bit = match (self.options.bitrate_bps, bit) {
+                (Some(bitrate_bps), _) => BitTime::of_rate(bitrate_bps),
+                (None, Some(cycles)) => BitTime::of_cycles(cycles),
+                (None, None) => BitTime::of_rate(DEFAULT_BITRATE_BPS),
+            };
+            let carries = bit.is_some() && self.options.channels.contains(&channel);
+            let source = carries.then(|| self.options.source(channel, self.rig.now(), u64::MAX));
+            self.rig.change_traffic(channel, bus_bit, source);
+        }
     }
 
     /// Serves a client until `seconds` of emulated time are over, or without end.
@@ -105,6 +132,7 @@ impl Served {
     fn millisecond(&mut self, reading: bool) -> Result<(), RigError> {
         self.rig.with_host(|host, _| host.read(reading));
         let bytes = self.rig.run_unbooked(MS)?;
+        self.follow_channels();
         self.waiting.extend(bytes);
         // The client cannot see a device that comes back by itself after a reset: its port stays.
         self.rig.with_host(|host, _| host.open_port());
@@ -190,7 +218,7 @@ impl EmulatedPort {
         let channels = Channels { to_client, from_client, stop: Arc::clone(&stop) };
         let last_words = Arc::clone(&end);
         let thread = std::thread::Builder::new().name("cantap-emulation".to_owned()).spawn(move || {
-            let mut served = match Served::start(image, &options, pace) {
+            let mut served = match Served::start(image, options, pace) {
                 Ok(served) => served,
                 Err(error) => {
                     let _ = started.send(Err(error));

@@ -63,9 +63,9 @@ pub struct Args {
     /// Channels that carry traffic and are captured: 1, 2 or both.
     #[arg(long, default_value = "both", value_parser = channels)]
     channels: Channels,
-    /// Bit rate of both buses, in bit/s.
-    #[arg(long, default_value = "1000000", value_name = "BPS")]
-    bitrate: u32,
+    /// Bit rate of both buses, in bit/s. Without, 1000000; with --pty, that of whoever opens the channel.
+    #[arg(long, value_name = "BPS")]
+    bitrate: Option<u32>,
     /// The host stops reading for this time, in the middle of the run.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     stall: Option<Duration>,
@@ -139,7 +139,7 @@ fn run(args: &Args) -> anyhow::Result<ExitCode> {
     })?;
     let options = options(args)?;
     if args.pty {
-        serve::pty(image, &options, args.seconds, args.real_time)?;
+        serve::pty(image, options, args.seconds, args.real_time)?;
         return Ok(ExitCode::SUCCESS);
     }
     // Before the run, so that a file that cannot be written does not cost one.
@@ -173,12 +173,13 @@ fn options(args: &Args) -> anyhow::Result<Options> {
         trace: args.trace.is_some(),
         ..Options::default()
     };
-    cantap_sim::rig::timing(args.bitrate)?;
+    let bitrate_bps = args.bitrate.unwrap_or(run::DEFAULT_BITRATE_BPS);
+    cantap_sim::rig::timing(bitrate_bps)?;
     if let Some(path) = &args.replay {
         let name = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("{name} cannot be read"))?;
         let lines = parse_log(&text, 0).with_context(|| name.to_string())?;
-        let (load, cycles) = run::replay(lines, args.bitrate);
+        let (load, cycles) = run::replay(lines, bitrate_bps);
         options.load = load;
         options.seconds = cycles as f64 / CYCLES_PER_SECOND as f64;
     }

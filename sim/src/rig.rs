@@ -325,6 +325,19 @@ impl Rig {
         wire.add(Node::new(bit));
     }
 
+    /// Gives the two nodes of [`Self::add_traffic`] another bit time and other frames.
+    pub fn change_traffic(&mut self, channel: Channel, bit: BitTime, source: Option<Box<dyn Source>>) {
+        let wire = &mut self.machine.board().wires[channel.index()];
+        wire.node(0).restart(bit, source);
+        wire.node(1).restart(bit, None);
+    }
+
+    /// Core cycles of a bit on a channel that takes part in its bus.
+    pub fn bit_cycles(&self, channel: Channel) -> Option<u64> {
+        let controller = &self.machine.board().can.controllers[channel.index()];
+        controller.listens().then(|| controller.timing().bit())
+    }
+
     /// Whether a channel's controller takes part in its bus, if only as a listener.
     pub fn takes_part(&self, channel: Channel) -> bool {
         self.machine.board().can.controllers[channel.index()].listens()

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use cantap_wire::{CHANNELS, Channel, Frame};
 use serde_json::{Value, json};
 
+use crate::bus::Source;
 use crate::bus::bits::bus_bits;
 use crate::capture::{Losses, Stamps};
 use crate::elf::Image;
@@ -17,6 +18,8 @@ use crate::traffic::{Kind, Script, Traffic};
 use crate::usb_host::Timing;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 
+/// The fastest bit rate of classical CAN, in bit/s.
+pub const DEFAULT_BITRATE_BPS: u32 = 1_000_000;
 /// The first 16 exceptions are the core's own.
 const FIRST_INTERRUPT: u16 = 16;
 /// The device may take so long to empty its queue when the traffic has ended.
@@ -47,8 +50,9 @@ pub struct Options {
     pub load: Load,
     /// Channels that are captured and carry traffic.
     pub channels: Vec<Channel>,
-    /// Bit rate of both buses, in bit/s.
-    pub bitrate_bps: u32,
+    /// Bit rate of both buses, in bit/s. Without, a run takes [`DEFAULT_BITRATE_BPS`], and a device that serves
+    /// somebody else's host has buses at the rate at which that host opens the channel.
+    pub bitrate_bps: Option<u32>,
     /// The host stops reading for so long, in the middle of the run.
     pub stall: Option<Duration>,
     /// Seed of the traffic.
@@ -66,7 +70,7 @@ impl Default for Options {
             seconds: 1.0,
             load: Load::Frames { kind: Kind::Std0, percent: 100.0 },
             channels: Channel::ALL.to_vec(),
-            bitrate_bps: 1_000_000,
+            bitrate_bps: None,
             stall: None,
             seed: 1,
             timing: Timing::default(),
@@ -125,14 +129,17 @@ pub struct Report {
 
 /// Runs `image` and captures from it.
 pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, Trace)>), RigError> {
+    let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
     let mut rig = Rig::new(image, Setup::default(), options.timing);
     let hello = rig.connect()?;
     for channel in &options.channels {
-        rig.listen(*channel, options.bitrate_bps)?;
+        rig.listen(*channel, bitrate_bps)?;
     }
     let from = rig.now() + MARGIN;
     let length = (options.seconds * CYCLES_PER_SECOND as f64) as u64;
-    add_traffic(&mut rig, options, from, from + length);
+    for channel in &options.channels {
+        rig.add_traffic(*channel, bitrate_bps, options.source(*channel, from, from + length));
+    }
     rig.run_for(from - rig.now())?;
 
     let bytes_before = rig.session.bytes();
@@ -174,7 +181,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
         channels: options
             .channels
             .iter()
-            .map(|channel| channel_report(&rig, *channel, seconds, options))
+            .map(|channel| channel_report(&rig, *channel, seconds, bitrate_bps))
             .collect(),
         wire_bytes_per_frame: bytes as f64 / delivered.max(1) as f64,
         queue_bytes: hello.queue_bytes,
@@ -191,27 +198,24 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     Ok((report, trace.map(|trace| (rig.machine, trace))))
 }
 
-/// Puts the traffic of `options` on the buses, from core cycle `from` to `until`.
-pub(crate) fn add_traffic(rig: &mut Rig, options: &Options, from: u64, until: u64) {
-    for channel in &options.channels {
-        let n = channel.index();
-        match &options.load {
+impl Options {
+    /// The traffic of a channel's bus, from core cycle `from` to `until`.
+    pub fn source(&self, channel: Channel, from: u64, until: u64) -> Box<dyn Source> {
+        match &self.load {
             Load::Frames { kind, percent } => {
                 // Two channels of one seed must not carry the same frames.
-                let seed = options.seed.wrapping_mul(CHANNELS as u64).wrapping_add(n as u64);
-                let traffic = Traffic::new(*kind, seed, *percent, from, until);
-                rig.add_traffic(*channel, options.bitrate_bps, traffic);
+                let seed = self.seed.wrapping_mul(CHANNELS as u64).wrapping_add(channel.index() as u64);
+                Box::new(Traffic::new(*kind, seed, *percent, from, until))
             }
             Load::Replay(logs) => {
-                let frames = logs[n].iter().map(|(at, frame)| (from + at, *frame));
-                let frames = frames.filter(|(at, _)| *at < until).collect();
-                rig.add_traffic(*channel, options.bitrate_bps, Script::new(frames));
+                let frames = logs[channel.index()].iter().map(|(at, frame)| (from + at, *frame));
+                Box::new(Script::new(frames.filter(|(at, _)| *at < until).collect()))
             }
         }
     }
 }
 
-fn channel_report(rig: &Rig, channel: Channel, seconds: f64, options: &Options) -> ChannelReport {
+fn channel_report(rig: &Rig, channel: Channel, seconds: f64, bitrate_bps: u32) -> ChannelReport {
     let sent = rig.ledger.on_bus_count(channel);
     let bits = rig.bus_bits(channel) as f64;
     ChannelReport {
@@ -220,7 +224,7 @@ fn channel_report(rig: &Rig, channel: Channel, seconds: f64, options: &Options) 
         delivered: rig.ledger.delivered_count(channel),
         lost: rig.ledger.losses(channel),
         frames_per_s: sent as f64 / seconds,
-        bus_load_pct: 100.0 * bits / (seconds * f64::from(options.bitrate_bps)),
+        bus_load_pct: 100.0 * bits / (seconds * f64::from(bitrate_bps)),
     }
 }
 

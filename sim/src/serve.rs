@@ -8,12 +8,7 @@ use cantap_sim::run::Options;
 
 /// Serves the device until it fails or `seconds` of emulated time are over.
 #[cfg(unix)]
-pub fn pty(
-    image: Image,
-    options: &Options,
-    seconds: Option<Duration>,
-    real_time: bool,
-) -> anyhow::Result<()> {
+pub fn pty(image: Image, options: Options, seconds: Option<Duration>, real_time: bool) -> anyhow::Result<()> {
     use cantap_sim::link::{Pace, Served};
     use cantap_sim::pty::Pty;
 
@@ -30,6 +25,6 @@ pub fn pty(
 
 /// There are no pseudo-terminals here.
 #[cfg(not(unix))]
-pub fn pty(_: Image, _: &Options, _: Option<Duration>, _: bool) -> anyhow::Result<()> {
+pub fn pty(_: Image, _: Options, _: Option<Duration>, _: bool) -> anyhow::Result<()> {
     anyhow::bail!("this system has no pseudo-terminals; use `cantap … -d emu:FIRMWARE.elf`")
 }

@@ -1,7 +1,6 @@
 //! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`.
 
 use std::fmt;
-use std::path::PathBuf;
 use std::str::FromStr;
 
 use super::DeviceError;
@@ -13,8 +12,8 @@ pub enum Address {
     Serial(String),
     /// The virtual device, with its options as typed.
     Virtual(String),
-    /// A firmware ELF on the emulated board.
-    Emulated(PathBuf),
+    /// A firmware ELF on the emulated board, with its options as typed.
+    Emulated(String),
 }
 
 impl FromStr for Address {
@@ -30,7 +29,7 @@ impl FromStr for Address {
             Some(("virtual", options)) => Ok(Self::Virtual(options.to_owned())),
             None if text == "virtual" => Ok(Self::Virtual(String::new())),
             Some(("emu", "")) => Err(bad("name the firmware, as in emu:firmware.elf")),
-            Some(("emu", file)) => Ok(Self::Emulated(file.into())),
+            Some(("emu", file)) => Ok(Self::Emulated(file.to_owned())),
             None if text == "emu" => Err(bad("name the firmware, as in emu:firmware.elf")),
             Some(("tcp", _)) => Err(bad("devices over TCP are not supported; use a serial port")),
             _ => Ok(Self::Serial(text.to_owned())),
@@ -44,7 +43,7 @@ impl fmt::Display for Address {
             Self::Serial(port) => f.write_str(port),
             Self::Virtual(options) if options.is_empty() => f.write_str("virtual"),
             Self::Virtual(options) => write!(f, "virtual:{options}"),
-            Self::Emulated(file) => write!(f, "emu:{}", file.display()),
+            Self::Emulated(file) => write!(f, "emu:{file}"),
         }
     }
 }

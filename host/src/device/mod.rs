@@ -446,10 +446,25 @@ fn connect(address: &Address) -> Result<Link, DeviceError> {
         }
         #[cfg(not(feature = "virtual"))]
         Address::Virtual(_) => not_built(address, "virtual"),
+        #[cfg(feature = "emu")]
+        Address::Emulated(file) => emulated(file, address),
+        #[cfg(not(feature = "emu"))]
         Address::Emulated(_) => not_built(address, "emu"),
     }
 }
 
+#[cfg(feature = "emu")]
+fn emulated(file: &str, address: &Address) -> Result<Link, DeviceError> {
+    let bad = |error: cantap_sim::address::AddressError| DeviceError::BadAddress {
+        address: address.to_string(),
+        reason: error.to_string(),
+    };
+    let parsed: cantap_sim::address::Address = file.parse().map_err(bad)?;
+    let port = parsed.open().map_err(bad)?;
+    Ok(Link::new(port.reader, port.writer).keeping(port.device))
+}
+
+#[cfg(not(all(feature = "serial", feature = "virtual", feature = "emu")))]
 fn not_built(address: &Address, feature: &'static str) -> Result<Link, DeviceError> {
     Err(DeviceError::NotBuilt { address: address.to_string(), feature })
 }

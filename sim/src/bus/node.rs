@@ -88,6 +88,14 @@ impl Node {
         Self { source: Some(Box::new(source)), ..self }
     }
 
+    /// Goes on with another bit time and other frames.
+    pub fn restart(&mut self, bit: BitTime, source: Option<Box<dyn Source>>) {
+        self.bit = bit;
+        self.queue.clear();
+        self.source = source;
+        self.refill();
+    }
+
     /// Queues a frame that is sent at core cycle `at` or as soon as possible after it.
     pub fn send_at(&mut self, at: u64, frame: Frame) {
         self.queue.push_back((at, frame));
@@ -127,5 +135,11 @@ impl Node {
         self.counters.sent();
         self.queue.pop_front();
         self.sent += 1;
+    }
+}
+
+impl Source for Box<dyn Source> {
+    fn next_frame(&mut self, bit: BitTime) -> Option<(u64, Frame)> {
+        self.as_mut().next_frame(bit)
     }
 }

@@ -1,0 +1,113 @@
+//! The product's claim: both channels saturated at 1 Mbit/s, and every frame arrives, in order and bit for
+//! bit; and where the host stops reading for longer than the queue lasts, every frame is counted.
+
+mod common;
+
+use std::time::Duration;
+
+use cantap_sim::run::{Load, Options, Report, run};
+use cantap_sim::traffic::Kind;
+use cantap_wire::Channel;
+
+/// Runs the firmware; the law of counting must hold.
+fn capture(options: &Options) -> Option<Report> {
+    let (report, _) = run(common::firmware()?, options).unwrap();
+    println!("{}", report.to_json());
+    assert!(report.ok, "{:?}", report.faults);
+    Some(report)
+}
+
+fn at_full_load(kind: Kind, seconds: f64) -> Options {
+    Options { seconds, load: Load::Frames { kind, percent: 100.0 }, ..Options::default() }
+}
+
+/// Both channels at full load lose nothing, and stamps are at most 2 us later than the best.
+fn nothing_is_lost(kind: Kind, seconds: f64, least_frames_per_s: f64) {
+    let Some(report) = capture(&at_full_load(kind, seconds)) else { return };
+    assert_eq!(report.channels.len(), 2);
+    for channel in &report.channels {
+        assert_eq!((channel.delivered, channel.lost.total()), (channel.sent, 0));
+        assert!(channel.frames_per_s >= least_frames_per_s, "{channel:?}");
+        assert!(channel.bus_load_pct > 99.5, "{channel:?}");
+    }
+    assert!(report.stamps.max - report.stamps.min <= 2000, "{:?}", report.stamps);
+}
+
+#[test]
+fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
+    nothing_is_lost(Kind::Std0, 2.0, 20_800.0);
+}
+
+#[test]
+fn remote_frames_of_47_bits_lose_nothing() {
+    nothing_is_lost(Kind::Rtr, 0.3, 21_250.0);
+}
+
+#[test]
+fn extended_frames_with_eight_bytes_lose_nothing() {
+    nothing_is_lost(Kind::Ext8, 0.5, 6_200.0);
+}
+
+#[test]
+fn standard_frames_with_eight_bytes_lose_nothing() {
+    nothing_is_lost(Kind::Std8, 0.3, 7_400.0);
+}
+
+#[test]
+fn a_mix_of_everything_loses_nothing() {
+    nothing_is_lost(Kind::Mix, 0.5, 8_000.0);
+}
+
+/// The queue holds 96 KiB: at 5 bytes and 48 us for each frame of the worst kind on one channel, 0.9 s.
+#[test]
+fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
+    for millis in [100, 300, 600] {
+        let options = Options {
+            stall: Some(Duration::from_millis(millis)),
+            channels: vec![Channel::Can1],
+            ..at_full_load(Kind::Std0, millis as f64 / 1000.0 + 0.15)
+        };
+        let Some(report) = capture(&options) else { return };
+        assert_eq!(report.channels[0].lost.total(), 0);
+        assert!(report.queue_high_water_bytes <= report.queue_bytes);
+        // What the stall left in the queue, less what the last moment before it flushed.
+        let least = 20_833.0 * 4.5 * millis as f64 / 1000.0;
+        assert!(f64::from(report.queue_high_water_bytes) > least, "{report:?}");
+    }
+}
+
+#[test]
+fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
+    let options = Options { stall: Some(Duration::from_millis(700)), ..at_full_load(Kind::Std0, 0.9) };
+    let Some(report) = capture(&options) else { return };
+    for channel in &report.channels {
+        assert!(channel.lost.queue > 1000, "{channel:?}");
+        assert_eq!((channel.lost.controller, channel.lost.link), (0, 0));
+        assert_eq!(channel.sent, channel.delivered + channel.lost.queue);
+    }
+}
+
+/// 2 packets of 64 bytes in a frame are 128 kB/s; two channels of this kind make 230 kB/s.
+#[test]
+fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {
+    let mut options = at_full_load(Kind::Ext8, 0.6);
+    options.timing.packets_per_frame = 2;
+    let Some(report) = capture(&options) else { return };
+    assert!(report.queue_high_water_bytes > 40_000, "{report:?}");
+    assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
+}
+
+/// The same seed gives the same run, another seed another.
+#[test]
+fn a_run_depends_on_its_seed_only() {
+    let figures = |seed| {
+        let options = Options { seed, ..at_full_load(Kind::Mix, 0.05) };
+        let report = capture(&options)?;
+        let mut json = report.to_json();
+        json["host_s_per_emulated_s"] = 0.into();
+        Some(json)
+    };
+    let Some(first) = figures(7) else { return };
+    assert_eq!(Some(&first), figures(7).as_ref());
+    assert_ne!(Some(first), figures(8));
+}

@@ -71,18 +71,27 @@ impl UsbPort {
     }
 }
 
+impl UsbPort {
+    /// Whether the data endpoint is in use.
+    fn sends(&self) -> bool {
+        let endpoint = self.class.write_ep().address().index();
+        device().diep(endpoint - 1).ctl().read().usbaep().bit()
+    }
+}
+
 impl Port for UsbPort {
     fn is_open(&self) -> bool {
-        // A pulled cable shows as suspend, because nothing measures VBUS.
-        self.device.state() == UsbDeviceState::Configured && self.class.dtr()
+        // A pulled cable shows as suspend, because nothing measures VBUS. A bus reset takes the endpoints out of use at
+        // once; the device's state follows only when it is over, at least 10 ms later.
+        self.device.state() == UsbDeviceState::Configured && self.class.dtr() && self.sends()
     }
 
     fn write(&mut self, packet: &[u8]) -> bool {
         // Between a bus reset and the end of the enumeration the driver has switched its endpoints off, but would take
         // a packet all the same, and the endpoint would be stuck with it (synopsys-usb-otg 0.4).
-        let endpoint = self.class.write_ep().address().index();
-        let active = device().diep(endpoint - 1).ctl().read().usbaep().bit();
-        active && self.device.state() == UsbDeviceState::Configured && self.class.write_packet(packet).is_ok()
+        self.sends()
+            && self.device.state() == UsbDeviceState::Configured
+            && self.class.write_packet(packet).is_ok()
     }
 
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {

@@ -23,16 +23,20 @@ def text(value):
     return str(value) if isinstance(value, int) else repr(float(value))
 
 
-def decode(message, node, data):
+def decode(message, node, data, texts):
     """Message.decode, which gives up on a multiplexer value that the database does not list, does the
-    same walk; this one keeps what is there in any case."""
+    same walk; this one keeps what is there in any case. `texts` gets those of value tables."""
+    from cantools.database.namedsignalvalue import NamedSignalValue
     from cantools.database.utils import decode_data
 
-    decoded = decode_data(data, message.length, node["signals"], node["formats"], False, True, True, True)
+    layout = (data, message.length, node["signals"], node["formats"])
+    decoded = decode_data(*layout, False, True, True, True)
+    named = decode_data(*layout, True, True, True, True)
+    texts.update({name: str(value) for name, value in named.items() if isinstance(value, NamedSignalValue)})
     for switch, children in node["multiplexers"].items():
         child = children.get(decoded.get(switch))
         if child is not None:
-            decoded.update(decode(message, child, data))
+            decoded.update(decode(message, child, data, texts))
     return decoded
 
 
@@ -55,7 +59,9 @@ def decode_file(path):
             answer = {"message": message.name, "id": message.frame_id, "extended": message.is_extended_frame}
             answer["data"] = data.hex()
             try:
-                values = decode(message, message._codecs, data)
+                texts = {}
+                values = decode(message, message._codecs, data, texts)
+                answer["texts"] = texts
                 answer["signals"] = {name: text(value) for name, value in values.items()}
             except Exception as error:
                 answer["failed"] = f"{type(error).__name__}: {error}"

@@ -99,7 +99,7 @@ fn a_fault_in_a_signal_file_names_line_and_symbol() {
         ("name = \"S\"\nat = \"D1:D2\"", "line 5: M.S: it spans several bytes: say order"),
         ("name = \"S\"\nstart = 1", "line 5: M.S: say where it is"),
         ("name = \"S\"\nstart = 1\nlength = 0", "line 5: M.S: a signal needs at least 1 bit"),
-        ("name = \"S\"\nat = \"D1\"\nfactor = 0", "line 5: M.S: factor 0 and offset 0 make no value"),
+        ("name = \"S\"\nat = \"D1\"\nfactor = inf", "line 5: M.S: factor inf and offset 0 make no value"),
         ("name = \"S\"\nat = \"D1\"\ntype = \"half\"", "line 5: M.S: a float of 8 bits does not exist"),
         (
             "name = \"S\"\nat = \"D1\"\nwhen = { signal = \"T\", is = 1 }",
@@ -141,8 +141,8 @@ fn a_fault_in_a_dbc_file_names_line_and_symbol() {
         ),
         (" SG_ Speed : 8|0@1+ (1,0) [0|0] \"\" A", "line 5: Engine.Speed: a signal needs at least 1 bit"),
         (
-            " SG_ Speed : 8|8@1+ (0,0) [0|0] \"\" A",
-            "line 5: Engine.Speed: factor 0 and offset 0 make no value",
+            " SG_ Speed : 8|8@1+ (1e999,0) [0|0] \"\" A",
+            "line 5: Engine.Speed: factor inf and offset 0 make no value",
         ),
         (" SG_ Speed : 8|-1@1+ (1,0) [0|0] \"\" A", "line 5: Engine.Speed: "),
         ("BO_ 2048 Big: 8 A", "line 5: Big: identifier 0x800 does not fit"),
@@ -214,6 +214,18 @@ fn parameter_groups_match_without_priority_and_addresses() {
     }
     assert_eq!(decode(&plain, 1, "18EA0001#05").as_deref(), Some("R=5"));
     assert_eq!(decode(&plain, 1, "0CEA5577#05"), None);
+}
+
+/// A frame of the boat in `nmea2000.log`: near Corinth, sent by address 2 and not by 254.
+#[test]
+fn a_real_nmea_2000_position_decodes() {
+    let text = format!(
+        "BO_ 2583167486 Position: 8 A\n SG_ Latitude : 0|32@1- (1e-07,0) [0|0] \"deg\" A\n \
+         SG_ Longitude : 32|32@1- (1e-07,0) [0|0] \"deg\" A\n{J1939}"
+    );
+    let decoder = decoder(dbc::parse("x.dbc", text.as_bytes()).unwrap());
+    let position = decode(&decoder, 1, "09F80102#36729A16021AB80D");
+    assert_eq!(position.as_deref(), Some("Latitude=37.922053399999996 Longitude=23.016909"));
 }
 
 #[test]

@@ -54,6 +54,8 @@ struct Line {
     #[serde(default)]
     data: String,
     signals: Option<BTreeMap<String, String>>,
+    #[serde(default)]
+    texts: BTreeMap<String, String>,
     failed: Option<String>,
 }
 
@@ -116,7 +118,7 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     let message = decoder.message(reference);
     let mut values = Vec::new();
     decoder.decode_data(reference, &bytes(&line.data), &mut values);
-    let mut ours: BTreeMap<_, _> = BTreeMap::new();
+    let (mut ours, mut texts) = (BTreeMap::new(), BTreeMap::new());
     for value in &values {
         let signal = &message.signals[value.signal as usize];
         let number = signal.number(value.raw);
@@ -126,8 +128,14 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
             "{number} is not {value:?}"
         );
         ours.insert(signal.name.as_str(), number);
+        if let Some(text) = signal.text(value.raw) {
+            texts.insert(signal.name.clone(), text.to_owned());
+        }
     }
     let mut found = Vec::new();
+    if texts != line.texts {
+        found.push(format!("texts: theirs {:?}, ours {texts:?}", line.texts));
+    }
     if message.name != line.message {
         found.push(format!("the name is {} here", message.name));
     }

@@ -99,7 +99,10 @@ pub enum FaultKind {
         /// Bytes that the message has.
         length: u16,
     },
-    /// Factor or offset is no finite number, or the factor is zero.
+    /// The factor is zero.
+    #[error("the factor is 0, so that every value is the offset")]
+    ZeroFactor,
+    /// Factor or offset is no finite number.
     #[error("factor {factor} and offset {offset} make no value")]
     Scale {
         /// The factor.
@@ -138,6 +141,7 @@ impl FaultKind {
         matches!(
             self,
             Self::TooManyBits(_)
+                | Self::ZeroFactor
                 | Self::OutsideMessage { .. }
                 | Self::DuplicateId { .. }
                 | Self::DuplicateSignal

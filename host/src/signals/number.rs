@@ -21,6 +21,16 @@ impl Number {
         }
     }
 
+    /// The number for a person's eyes: a float at 15 digits, which hides that 379220534 · 1e-7 is
+    /// 37.922053399999996.
+    #[must_use]
+    pub fn for_people(self) -> Self {
+        match self {
+            Self::Real(value) => Self::Real(format!("{value:.14e}").parse().unwrap_or(value)),
+            Self::Integer(_) => self,
+        }
+    }
+
     /// Whether it is a number that JSON can carry: neither infinite nor not-a-number.
     pub fn is_finite(self) -> bool {
         match self {
@@ -64,5 +74,7 @@ mod tests {
         ] {
             assert_eq!(number.to_string(), text);
         }
+        assert_eq!(Number::Real(379_220_534.0 * 1e-7).for_people().to_string(), "37.9220534");
+        assert_eq!(Number::Real(f64::NAN).for_people().to_string(), "NaN");
     }
 }

@@ -55,8 +55,10 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
             report(signal, FaultKind::FloatLength(signal.length));
         }
         let (factor, offset) = (signal.factor, signal.offset);
-        if factor == 0.0 || !factor.is_finite() || !offset.is_finite() {
+        if !factor.is_finite() || !offset.is_finite() {
             report(signal, FaultKind::Scale { factor, offset });
+        } else if factor == 0.0 {
+            report(signal, FaultKind::ZeroFactor);
         }
         let (needed, length) = (signal.bytes_needed(), message.length);
         if needed > length.into() {

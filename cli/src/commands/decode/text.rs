@@ -20,7 +20,7 @@ pub fn write_values(out: &mut impl Write, message: &Message, values: &[SignalVal
     for (at, value) in values.iter().enumerate() {
         let signal = &message.signals[value.signal as usize];
         let comma = if at == 0 { "" } else { "," };
-        write!(out, "{comma} {} = {}", signal.name, signal.number(value.raw))?;
+        write!(out, "{comma} {} = {}", signal.name, signal.number(value.raw).for_people())?;
         if !signal.unit.is_empty() {
             write!(out, " {}", signal.unit)?;
         }

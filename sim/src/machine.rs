@@ -236,7 +236,12 @@ impl Machine {
         }
         match change {
             Change::Enter(HARD_FAULT) | Change::Chain(_, HARD_FAULT) => {
-                Err(self.stopped(Reason::HardFault(self.cpu.fault_status())))
+                let mut stopped = self.stopped(Reason::HardFault(self.cpu.fault_status()));
+                // There is no ROM to fetch from.
+                if map::SYSTEM_MEMORY.contains(&stopped.pc) {
+                    stopped.reason = Reason::Bootloader;
+                }
+                Err(stopped)
             }
             _ => Ok(()),
         }
@@ -267,9 +272,6 @@ impl Machine {
         self.look_in = LOOK_EVERY;
         if self.cpu.locked_up() {
             return Err(self.stopped(Reason::LockUp));
-        }
-        if map::SYSTEM_MEMORY.contains(&self.cpu.state().pc) {
-            return Err(self.stopped(Reason::Bootloader));
         }
         if self.cpu.reset_requested() {
             if self.setup.stop_on_reset {

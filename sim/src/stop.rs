@@ -76,17 +76,28 @@ impl Stopped {
             sp = sp.wrapping_add(32);
         }
         let mut stack = vec![image.describe(pc)];
-        let returns = (0..MAX_STACK / 4).map_while(|word| cpu.word(sp.wrapping_add(4 * word)));
-        for address in std::iter::once(lr).chain(returns) {
-            if stack.len() < MAX_DEPTH && is_return_address(address, cpu) {
-                let name = image.describe(address & !1);
-                if stack.last() != Some(&name) {
-                    stack.push(name);
-                }
+        // The link register, then the stack, each with the address above it.
+        let words = (0..MAX_STACK / 4).map(|word| sp.wrapping_add(4 * word));
+        let words = words.map_while(|at| Some((cpu.word(at)?, at.wrapping_add(4))));
+        for (word, above) in std::iter::once((lr, sp)).chain(words) {
+            let caller = if is_exception_return(word) {
+                // A handler's return lies right below what it interrupted.
+                cpu.word(above.wrapping_add(24)).filter(|pc| map::FLASH.contains(pc))
+            } else {
+                is_return_address(word, cpu).then_some(word & !1)
+            };
+            let Some(name) = caller.map(|address| image.describe(address)) else { continue };
+            if stack.len() < MAX_DEPTH && stack.last() != Some(&name) {
+                stack.push(name);
             }
         }
         Self { reason, at: cpu.now(), pc, stack }
     }
+}
+
+/// Whether a word is what a handler finds in its link register.
+fn is_exception_return(word: u32) -> bool {
+    matches!(word | 0x10, 0xFFFF_FFF1 | 0xFFFF_FFF9 | 0xFFFF_FFFD)
 }
 
 /// Whether a word is the address after a call: odd, in flash, and preceded by BL or BLX.

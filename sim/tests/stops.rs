@@ -1,10 +1,14 @@
 //! Runs that end before their time: each says why, where, and who called.
 
 mod assembly;
+mod common;
 
 use assembly::{EQ, Program, adds, cmp, ldr, movs, nop, str, udf, wfi};
 use cantap_sim::memory_map::{CCM, FLASH, SRAM};
+use cantap_sim::rig::{Rig, RigError};
+use cantap_sim::usb_host::Timing;
 use cantap_sim::{CYCLES_PER_SECOND, ElfError, Image, Machine, Reason, Setup, Stopped};
+use cantap_wire::Command;
 
 const SECOND: u64 = CYCLES_PER_SECOND;
 /// Machine numbers in an ELF's header.
@@ -86,6 +90,52 @@ fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
     machine.run_until(SECOND).unwrap();
     assert_eq!((machine.resets(), machine.cpu().word(SRAM.start)), (2, Some(3)));
     assert!(machine.cpu().asleep());
+}
+
+/// The firmware with one exception's vector bent to `target`, until it ends there.
+fn bend(number: u32, target: impl Fn(&Image) -> u32) -> Option<(Image, Stopped)> {
+    let image = common::firmware()?;
+    let mut rig = Rig::new(image.clone(), Setup::default(), Timing::default());
+    rig.connect().unwrap();
+    let vector = FLASH.start + 4 * number;
+    let bent = (target(&image) | 1).to_le_bytes();
+    assert!(rig.machine.cpu().memory(vector).is_some_and(|flash| flash.write(vector, &bent)));
+    match rig.run_for(SECOND / 10) {
+        Err(RigError::Stopped(stopped)) => Some((image, stopped)),
+        other => panic!("the firmware must end: {other:?}"),
+    }
+}
+
+/// TIM7 makes the firmware's millisecond.
+const TIM7: u32 = 16 + 55;
+
+#[test]
+fn a_panic_ends_the_run_where_it_began() {
+    let panic = |image: &Image| image.address_of("__rustc::rust_begin_unwind").expect("the panic handler");
+    let Some((_, stopped)) = bend(TIM7, panic) else { return };
+    assert_eq!((stopped.reason, &stopped.stack[0][..]), (Reason::Panic, "__rustc::rust_begin_unwind"));
+}
+
+#[test]
+fn a_fault_in_the_firmware_names_the_function_and_its_callers() {
+    // No code: the next instruction is fetched from erased flash.
+    let Some((image, stopped)) = bend(TIM7, |_| FLASH.end - 16) else { return };
+    assert!(matches!(stopped.reason, Reason::HardFault(_)), "{stopped}");
+    assert!(FLASH.contains(&stopped.pc) && image.function_at(stopped.pc).is_none());
+    assert!(stopped.stack.iter().any(|function| function.starts_with("main")), "{stopped}");
+}
+
+#[test]
+fn entering_the_rom_bootloader_ends_the_run() {
+    let Some(image) = common::firmware() else { return };
+    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    rig.connect().unwrap();
+    let (_, bytes) = rig.session.request(Command::Bootloader);
+    rig.with_host(|host, _| host.send(&bytes));
+    match rig.run_for(SECOND / 5) {
+        Err(RigError::Stopped(stopped)) => assert_eq!(stopped.reason, Reason::Bootloader, "{stopped}"),
+        other => panic!("{other:?}"),
+    }
 }
 
 #[test]

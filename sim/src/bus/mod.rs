@@ -304,8 +304,11 @@ impl Wire {
         members.extend(&twins);
         let senders = members.len();
         members.extend(collided.iter().map(|(member, _)| *member));
-        let receivers: Vec<Member> =
-            self.members().filter(|member| !members.contains(member) && listens(*member, can)).collect();
+        let receivers: Vec<Member> = self
+            .members()
+            .filter(|member| !members.contains(member))
+            .filter(|member| listens(*member, can) && self.understands(*member, bit))
+            .collect();
         members.extend(&receivers);
         let participants: Vec<Participant> = members
             .iter()
@@ -364,6 +367,15 @@ impl Wire {
             steps: steps.into(),
         });
         self.started += 1;
+    }
+
+    /// Simulated nodes of another bit rate than the frame's are left out of it: only the emulated controllers are
+    /// shown what a wrong bit rate looks like.
+    fn understands(&self, member: Member, bit: BitTime) -> bool {
+        match member {
+            Member::Controller(_) => true,
+            Member::Node(n) => self.nodes[n].bit.agrees_with(&bit),
+        }
     }
 
     /// Whether a member acknowledges, and whether it flags errors with dominant bits.

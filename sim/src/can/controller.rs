@@ -448,6 +448,8 @@ impl Controller {
         if self.init_pending {
             self.init_pending = false;
             self.mode = Mode::Initialisation;
+        } else if self.mode == Mode::Normal && self.mcr & mcr::SLEEP != 0 {
+            self.fall_asleep();
         }
     }
 

@@ -7,8 +7,8 @@ use cantap_wire::Channel;
 use crate::elf::{ElfError, Image};
 use crate::link::{EmulatedPort, Pace, ServeError};
 use crate::rig::{RigError, timing};
-use crate::run::{Load, Options};
-use crate::traffic::Kind;
+use crate::run::{DEFAULT_BITRATE_BPS, Load, Options, replay};
+use crate::traffic::{Kind, parse_log};
 
 /// Traffic that leaves the emulation close to real time.
 const DEFAULT_LOAD_PERCENT: f64 = 20.0;
@@ -17,7 +17,8 @@ const DEFAULT_LOAD_PERCENT: f64 = 20.0;
 ///
 /// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `bitrate` (bit/s; by default that of whoever
 /// opens the channel), `channels` (`1`, `2` or `both`: those with traffic), `seed`, `pace` (`client`: time stands still
-/// while the client does not read; `real`: it goes on).
+/// while the client does not read; `real`: it goes on), and at the end `log=FILE` (a candump log, replayed at its own
+/// times from the moment a channel is opened; its first interface is channel 1).
 #[derive(Clone, Debug)]
 pub struct Address {
     /// The firmware.
@@ -32,7 +33,7 @@ pub struct Address {
 #[derive(Debug, thiserror::Error)]
 pub enum AddressError {
     /// There is no such option.
-    #[error("there is no option '{0}'; there are load, frames, bitrate, channels, seed, pace")]
+    #[error("there is no option '{0}'; there are load, frames, bitrate, channels, seed, pace, log")]
     Unknown(String),
     /// The value does not fit.
     #[error("'{value}' does not fit the option '{key}': {reason}")]
@@ -56,6 +57,7 @@ impl std::str::FromStr for Address {
     type Err = AddressError;
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let (text, log) = text.split_once(",log=").map_or((text, None), |(text, log)| (text, Some(log)));
         // A comma in the file's name is part of it, unless what follows is an option.
         let mut file = text;
         let mut given = Vec::new();
@@ -70,6 +72,14 @@ impl std::str::FromStr for Address {
         let mut address = Self { file: file.into(), options, pace: Pace::Client };
         for (key, value) in given.into_iter().rev() {
             address.set(key, value)?;
+        }
+        if let Some(log) = log {
+            let bad =
+                |reason: String| AddressError::Value { key: "log".to_owned(), value: log.to_owned(), reason };
+            let text = std::fs::read_to_string(log).map_err(|error| bad(error.to_string()))?;
+            let lines = parse_log(&text, 0).map_err(|error| bad(error.to_string()))?;
+            let bitrate_bps = address.options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
+            address.options.load = replay(lines, bitrate_bps).0;
         }
         Ok(address)
     }
@@ -148,6 +158,7 @@ mod tests {
             ("a.elf,frames=fd", "std0"),
             ("a.elf,bitrate=1000001", "1000001 bit/s"),
             ("a.elf,pace=slow", "client or real"),
+            ("a.elf,log=no.log", "no.log"),
         ] {
             let error = text.parse::<Address>().unwrap_err().to_string();
             assert!(error.contains(what), "{text}: {error}");

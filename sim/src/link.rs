@@ -65,6 +65,8 @@ pub struct Served {
     options: Options,
     /// Cycles of a bit of each channel that is open.
     open: [Option<u64>; CHANNELS],
+    /// When the first of the channels that are open was opened: what is replayed begins then.
+    origin: u64,
     waiting: VecDeque<u8>,
 }
 
@@ -78,7 +80,7 @@ impl Served {
             let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
             rig.add_traffic(channel, bitrate_bps, Script::new(Vec::new()));
         }
-        Ok(Self { rig, pace, options, open: [None; CHANNELS], waiting: VecDeque::new() })
+        Ok(Self { rig, pace, options, open: [None; CHANNELS], origin: 0, waiting: VecDeque::new() })
     }
 
     /// Starts and ends the traffic of channels that were opened and closed.
@@ -88,6 +90,9 @@ impl Served {
             if bit == self.open[channel.index()] {
                 continue;
             }
+            if self.open == [None; CHANNELS] {
+                self.origin = self.rig.now();
+            }
             self.open[channel.index()] = bit;
             let bus_bit = match (self.options.bitrate_bps, bit) {
                 (Some(bitrate_bps), _) => BitTime::of_rate(bitrate_bps),
@@ -95,7 +100,8 @@ impl Served {
                 (None, None) => BitTime::of_rate(DEFAULT_BITRATE_BPS),
             };
             let carries = bit.is_some() && self.options.channels.contains(&channel);
-            let source = carries.then(|| self.options.source(channel, self.rig.now(), u64::MAX));
+            let now = self.rig.now();
+            let source = carries.then(|| self.options.source(channel, self.origin, now, u64::MAX));
             self.rig.change_traffic(channel, bus_bit, source);
         }
     }

@@ -138,7 +138,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     let from = rig.now() + MARGIN;
     let length = (options.seconds * CYCLES_PER_SECOND as f64) as u64;
     for channel in &options.channels {
-        rig.add_traffic(*channel, bitrate_bps, options.source(*channel, from, from + length));
+        rig.add_traffic(*channel, bitrate_bps, options.source(*channel, from, from, from + length));
     }
     rig.run_for(from - rig.now())?;
 
@@ -199,8 +199,9 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
 }
 
 impl Options {
-    /// The traffic of a channel's bus, from core cycle `from` to `until`.
-    pub fn source(&self, channel: Channel, from: u64, until: u64) -> Box<dyn Source> {
+    /// The traffic of a channel's bus, from core cycle `from` to `until`. What is replayed has its first frame at
+    /// `origin`.
+    pub fn source(&self, channel: Channel, origin: u64, from: u64, until: u64) -> Box<dyn Source> {
         match &self.load {
             Load::Frames { kind, percent } => {
                 // Two channels of one seed must not carry the same frames.
@@ -208,8 +209,8 @@ impl Options {
                 Box::new(Traffic::new(*kind, seed, *percent, from, until))
             }
             Load::Replay(logs) => {
-                let frames = logs[channel.index()].iter().map(|(at, frame)| (from + at, *frame));
-                Box::new(Script::new(frames.filter(|(at, _)| *at < until).collect()))
+                let frames = logs[channel.index()].iter().map(|(at, frame)| (origin + at, *frame));
+                Box::new(Script::new(frames.filter(|(at, _)| (from..until).contains(at)).collect()))
             }
         }
     }

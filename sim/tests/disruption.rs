@@ -7,7 +7,7 @@ mod common;
 use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::{Status, Timing};
+use cantap_sim::usb_host::{Status, Timing, UsbHost};
 use cantap_wire::{Channel, Command};
 
 /// Random instants in the test; each costs about a tenth of a second.
@@ -181,7 +181,7 @@ fn resume_needs_no_enumeration() {
     rig.run_for(50 * MS).unwrap();
     assert_eq!(rig.with_host(|host, _| host.status()), Status::Suspended);
     rig.cut();
-    rig.with_host(|host, otg| host.resume(otg));
+    rig.with_host(UsbHost::resume);
     rig.run_for(40 * MS).unwrap();
     begin(&mut rig);
     rig.run_for(10 * MS).unwrap();

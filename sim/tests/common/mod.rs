@@ -1,4 +1,5 @@
 //! The firmware that the tests run: what `cargo xtask firmware` built.
+#![allow(dead_code, reason = "each test file uses its part")]
 
 use std::path::{Path, PathBuf};
 

@@ -1,9 +1,10 @@
 //! What commands that send have in common: a device open for sending, and what became of each frame.
 
 use std::io::Write;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::bail;
+use cantap::Device;
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
 use cantap::wire::record::TransmitFailure;
@@ -70,6 +71,33 @@ impl Tally {
             ),
             None => Ok(()),
         }
+    }
+}
+
+/// Looks after a bus while frames wait for their time: silence alone does not tell that it is dead.
+pub struct BusWatch<'d> {
+    device: &'d Device,
+    look_at: Instant,
+}
+
+impl<'d> BusWatch<'d> {
+    /// Watches the buses of a device.
+    pub fn new(device: &'d Device) -> Self {
+        Self { device, look_at: Instant::now() + GIVE_UP_AFTER }
+    }
+
+    /// False after Ctrl-C, and where a controller is so far gone (error passive, bus-off) that nobody hears it.
+    pub fn goes_on(&mut self) -> bool {
+        const PASSIVE: u8 = 128;
+        if self.look_at <= Instant::now() {
+            self.look_at = Instant::now() + GIVE_UP_AFTER;
+            // An error is told by the next request.
+            let channels = self.device.status().map(|status| status.channels);
+            if channels.is_ok_and(|channels| channels.iter().any(|channel| channel.tec >= PASSIVE)) {
+                return false;
+            }
+        }
+        !interrupt::requested()
     }
 }
 

@@ -115,3 +115,52 @@ fn device_care_is_one_line_each() {
     let (code, _, err) = cantap("update -d virtual Cargo.toml");
     assert!(code == Some(1) && err.contains("no firmware image"), "{err}");
 }
+
+#[test]
+fn autobaud_finds_the_rate_and_tells_silence_from_noise() {
+    let (code, out, err) = cantap("autobaud -d virtual:bitrate=125k --json");
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((&object["bitrate_bps"], &object["channel"]), (&125_000.into(), &1.into()));
+    assert!(object["frames"].as_u64() >= Some(4) && object["seconds"].as_f64() < Some(2.0), "{out}");
+    let (code, _, err) = cantap("autobaud -d virtual:load=0 -t 200ms");
+    assert!(code == Some(1) && err.contains("no traffic on channel 1"), "{err}");
+}
+
+#[test]
+fn made_up_frames_come_at_their_gap() {
+    let (code, out, err) = cantap("gen -d virtual:load=0 can1 -g 10 -I 42A -L 1 -D i -n 5 -v");
+    assert_eq!((code, err.as_str()), (Some(0), "cantap: 5 frames sent\n"));
+    assert_eq!(frames(&out)[4], "can1 42A#04 T");
+    for pair in times_us(&out).windows(2) {
+        assert!((pair[1] - pair[0] - 10_000).abs() <= 4, "{out}");
+    }
+    let (code, _, err) = cantap("gen -d virtual:ack=no,load=0 can0 -g 0 -n 10");
+    assert!(code == Some(1) && err.contains("nobody acknowledged"), "{err}");
+}
+
+#[test]
+fn a_replayed_trace_keeps_its_times_and_order() {
+    let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("replay.log");
+    let mut log = String::new();
+    let mut expected = Vec::new();
+    for n in 0..600_u32 {
+        use std::fmt::Write;
+        let (interface, length) = (n % 2, (n % 9) as usize);
+        let frame = format!("{:03X}#{}", n % 0x700, "5A".repeat(length));
+        writeln!(log, "(1.{:06}) can{interface} {frame}", n * 500).unwrap();
+        expected.push(format!("can{interface} {frame} T"));
+    }
+    std::fs::write(&path, log).unwrap();
+    let (code, out, err) = cantap(&format!("replay -d virtual:load=0 {} --json", path.display()));
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((&object["frames"], &object["failed"]), (&600.into(), &0.into()));
+    // Both ways a tick's rounding.
+    assert!(object["early_us"].as_f64() <= Some(0.2) && object["late_us"].as_f64() <= Some(0.2), "{out}");
+    let (code, out, _) = cantap(&format!("replay -d virtual:load=0 {} --speed 4 -v", path.display()));
+    assert_eq!((code, frames(&out)), (Some(0), expected));
+    let (code, out, _) = cantap(&format!("replay -d virtual:load=0 {} can1=can0 -n 3 -t -v", path.display()));
+    assert_eq!((code, frames(&out).len()), (Some(0), 3));
+    assert!(out.lines().all(|line| line.contains("can1 ")), "{out}");
+}

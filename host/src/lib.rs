@@ -1,6 +1,7 @@
 //! The cantap host library: devices, records, time, statistics; trace files and signals behind
 //! features, so that a program that only captures stays small.
 
+pub mod autobaud;
 pub mod bit_timing;
 pub mod bits;
 #[cfg(feature = "signals")]
@@ -14,6 +15,7 @@ pub mod hw_filter;
 pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;
+pub mod replay;
 #[cfg(feature = "signals")]
 pub mod search;
 #[cfg(feature = "signals")]

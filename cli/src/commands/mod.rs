@@ -1,5 +1,6 @@
 //! The subcommands. Each file has an `Args` for its command line and a `run`.
 
+pub mod autobaud;
 pub mod bits;
 pub mod capture;
 pub mod care;
@@ -7,10 +8,12 @@ pub mod completions;
 pub mod decode;
 pub mod demo;
 pub mod diff;
+pub mod r#gen;
 pub mod info;
 pub mod list;
 pub mod monitor;
 pub mod plot;
+pub mod replay;
 pub mod search;
 pub mod send;
 pub mod stats;
@@ -55,8 +58,14 @@ pub enum Command {
     Virtual(virtual_device::Args),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
+    /// Find a bus's bit rate by listening only.
+    Autobaud(autobaud::Args),
     /// Send frames: now, periodically, or in reply.
     Send(Box<send::Args>),
+    /// Send made-up frames, with cangen's options.
+    Gen(r#gen::Args),
+    /// Play a trace on a bus at its own times.
+    Replay(Box<replay::Args>),
     /// Blink a device's LEDs, to find it among others.
     Identify(care::Identify),
     /// Restart a device's firmware.
@@ -87,7 +96,10 @@ impl Command {
             #[cfg(unix)]
             Self::Virtual(args) => virtual_device::run(&args),
             Self::Status(args) => status::run(&args),
+            Self::Autobaud(args) => autobaud::run(&args),
             Self::Send(args) => send::run(&args),
+            Self::Gen(args) => r#gen::run(&args),
+            Self::Replay(args) => replay::run(&args),
             Self::Identify(args) => care::identify(&args),
             Self::Reset(args) => care::reset(&args),
             Self::Update(args) => care::update(&args),

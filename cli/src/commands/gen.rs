@@ -1,0 +1,241 @@
+//! `cantap gen`: made-up frames, with cangen's options.
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use cantap::replay::{Pace, Replay};
+use cantap::wire::CHANNELS;
+use cantap::wire::message::Mode;
+use cantap::{Address, Channel, Device, Frame, Id};
+
+use crate::channel_args::{self, ChannelArgs};
+use crate::interrupt;
+use crate::sending::{BusWatch, Tally};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Modes for -I, -L and -D: r random, i counting up, e even random, o odd random, or a value.\n\n\
+                        Examples:\n  cantap gen -d virtual can0 -g 10 -I 42A -L 8 -D i -n 1000\n  \
+                        cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m"
+)]
+pub struct Args {
+    /// Where the device is: a serial port, or virtual.
+    #[arg(short, long)]
+    device: Address,
+    /// can0 or 1, can1 or 2.
+    #[arg(value_parser = channel_args::channel)]
+    channel: Channel,
+    #[command(flatten)]
+    open: ChannelArgs,
+    /// Time from one frame to the next in milliseconds; 0 as fast as the bus takes them.
+    #[arg(short, long, value_name = "MS", default_value_t = 200.0, value_parser = gap)]
+    gap: f64,
+    /// 29-bit identifiers.
+    #[arg(short, long)]
+    extended: bool,
+    /// Remote frames.
+    #[arg(short = 'R', long)]
+    remote: bool,
+    /// Mix standard and extended, data and remote frames.
+    #[arg(short, long)]
+    mix: bool,
+    /// Identifiers.
+    #[arg(short = 'I', long, value_name = "MODE|HEX", default_value = "r", value_parser = identifier)]
+    id: Values,
+    /// Lengths, 0 to 8.
+    #[arg(short = 'L', long, value_name = "MODE|N", value_parser = length)]
+    length: Option<Values>,
+    /// Data.
+    #[arg(short = 'D', long, value_name = "MODE|HEX", default_value = "r", value_parser = data)]
+    data: Data,
+    /// End after so many frames.
+    #[arg(short = 'n', long)]
+    frames: Option<u64>,
+    /// Makes another sequence.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Print each frame that was sent.
+    #[arg(short, long)]
+    verbose: bool,
+}
+
+/// Where a number comes from.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Values {
+    Random,
+    Even,
+    Odd,
+    Count,
+    Fixed(u32),
+}
+
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Data {
+    Varying(Values),
+    Fixed(Vec<u8>),
+}
+
+fn mode(text: &str) -> Option<Values> {
+    match text {
+        "r" => Some(Values::Random),
+        "e" => Some(Values::Even),
+        "o" => Some(Values::Odd),
+        "i" => Some(Values::Count),
+        _ => None,
+    }
+}
+
+fn identifier(text: &str) -> Result<Values, String> {
+    let hex = text.bytes().all(|digit| digit.is_ascii_hexdigit());
+    let number = || u32::from_str_radix(text, 16).ok().filter(|id| hex && *id <= Id::MAX_EXTENDED);
+    mode(text)
+        .or_else(|| number().map(Values::Fixed))
+        .ok_or_else(|| "write r, i, e, o or a hexadecimal identifier up to 1FFFFFFF".to_owned())
+}
+
+fn length(text: &str) -> Result<Values, String> {
+    let number = || text.parse().ok().filter(|length| *length <= 8);
+    mode(text)
+        .or_else(|| number().map(Values::Fixed))
+        .ok_or_else(|| "write r, i, e, o or a length from 0 to 8".to_owned())
+}
+
+fn data(text: &str) -> Result<Data, String> {
+    if let Some(mode) = mode(text) {
+        return Ok(Data::Varying(mode));
+    }
+    // The frame's own parser knows what data look like.
+    let frame = format!("000#{text}").parse::<Frame>().ok().filter(|frame| !frame.is_remote());
+    frame
+        .map(|frame| Data::Fixed(frame.data().to_vec()))
+        .ok_or_else(|| "write r, i, e, o or up to 8 bytes in hexadecimal".to_owned())
+}
+
+fn gap(text: &str) -> Result<f64, String> {
+    let value = text.parse().ok().filter(|ms| (0.0..=3_600_000.0).contains(ms));
+    value.ok_or_else(|| "write milliseconds, such as 200 or 0.5".to_owned())
+}
+
+/// Makes the frames.
+struct Generator<'a> {
+    args: &'a Args,
+    random: fastrand::Rng,
+    count: u64,
+}
+
+impl Generator<'_> {
+    fn number(&mut self, values: Values, below: u32) -> u32 {
+        match values {
+            Values::Random => self.random.u32(..below),
+            Values::Even => self.random.u32(..below) & !1,
+            // Of an odd limit (lengths 0 to 8) the highest number is even.
+            Values::Odd => self.random.u32(..below & !1) | 1,
+            Values::Count => (self.count % u64::from(below)) as u32,
+            Values::Fixed(value) => value,
+        }
+    }
+
+    fn frame(&mut self) -> Frame {
+        let Args { extended, remote, mix, id, length, data, .. } = self.args;
+        let wide = matches!(id, Values::Fixed(id) if *id > Id::MAX_STANDARD);
+        let extended = wide || if *mix { self.random.bool() } else { *extended };
+        let remote = if *mix { self.random.bool() } else { *remote };
+        let id = if extended {
+            Id::extended_truncated(self.number(*id, Id::MAX_EXTENDED + 1))
+        } else {
+            Id::standard_truncated(self.number(*id, Id::MAX_STANDARD + 1))
+        };
+        let length = match (length, data) {
+            (Some(values), _) => self.number(*values, 9),
+            (None, Data::Fixed(bytes)) => bytes.len() as u32,
+            (None, Data::Varying(_)) => self.random.u32(..9),
+        };
+        let mut bytes = [0; 8];
+        match data {
+            Data::Fixed(fixed) => bytes[..fixed.len()].copy_from_slice(fixed),
+            // Counts as one number, the first byte fastest, as cangen does.
+            Data::Varying(Values::Count) => bytes = self.count.to_le_bytes(),
+            Data::Varying(values) => {
+                let (keep, set) = match values {
+                    Values::Even => (0xFE, 0),
+                    Values::Odd => (0xFF, 1),
+                    _ => (0xFF, 0),
+                };
+                bytes.fill_with(|| self.random.u8(..) & keep | set);
+            }
+        }
+        self.count += 1;
+        Frame::from_bus(id, remote, length as u8, bytes)
+    }
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    interrupt::watch()?;
+    let device = Device::open(&args.device)?;
+    let config = args.open.open(&device, args.channel, Mode::Normal, &[])?;
+    let bitrates_bps = [config.timing.bitrate_bps(device.hello().can_clock_hz); CHANNELS];
+    let gap = Duration::from_secs_f64(args.gap / 1e3);
+    // A trace of frames that all end at once, held apart by the gap.
+    let pace = Pace { shortest_gap: gap, ignore_times: gap.is_zero(), ..Pace::default() };
+    let mut replay = Replay::new(&device, pace, bitrates_bps)?;
+    let mut tally = Tally::new(!args.verbose);
+    let mut bus = BusWatch::new(&device);
+    let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
+    while args.frames.is_none_or(|frames| generator.count < frames) {
+        let frame = generator.frame();
+        if !bus.goes_on() || !replay.push(0, args.channel, frame, || bus.goes_on())? {
+            break;
+        }
+        tally.add(&replay.take_ended())?;
+    }
+    if !interrupt::requested() {
+        replay.finish(|_| bus.goes_on())?;
+    }
+    tally.add(&replay.take_ended())?;
+    let waiting = replay.under_way();
+    device.stop()?;
+    eprintln!("cantap: {} frames sent", tally.sent);
+    tally.verdict(if interrupt::requested() { 0 } else { waiting })?;
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Parser)]
+    struct Line {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn frames(line: &str, count: usize) -> Vec<String> {
+        let line = ["x", "-d", "virtual", "can0"].into_iter().chain(line.split_whitespace());
+        let args = Line::parse_from(line).args;
+        let mut generator = Generator { args: &args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
+        (0..count).map(|_| generator.frame().to_string()).collect()
+    }
+
+    #[test]
+    fn options_mean_what_cangen_says() {
+        assert_eq!(frames("-I 42A -L 1 -D i", 3), ["42A#00", "42A#01", "42A#02"]);
+        assert_eq!(frames("-I i -D 11.22", 2), ["000#1122", "001#1122"]);
+        assert_eq!(frames("-I 7FF -L 4 -R", 1), ["7FF#R4"]);
+        assert_eq!(frames("-e -I 1 -L 0", 1), ["00000001#"]);
+        assert_eq!(frames("-I 1FFFFFFF -L 0", 1), ["1FFFFFFF#"]);
+    }
+
+    #[test]
+    fn random_values_keep_their_parity_and_range() {
+        for frame in frames("-I o -L e -D e", 200) {
+            let frame: Frame = frame.parse().unwrap();
+            assert!(frame.id().raw() % 2 == 1 && frame.dlc().is_multiple_of(2) && frame.dlc() <= 8);
+            assert!(frame.data().iter().all(|byte| byte.is_multiple_of(2)));
+        }
+        assert!(frames("-L o", 100).iter().all(|frame| frame.parse::<Frame>().unwrap().dlc() % 2 == 1));
+        assert_ne!(frames("--seed 2", 10), frames("--seed 3", 10));
+    }
+}

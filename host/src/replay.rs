@@ -1,0 +1,223 @@
+//! Plays a trace on a bus at its own times, kept by the device's clock.
+//!
+//! A trace's time is a frame's end; the device is told when to begin. So each frame's exact length is taken off, and the
+//! frames end as far apart as in the trace, whatever their lengths. The host streams ahead of time as much as
+//! the device's queue holds; its own delays do not show on the bus.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use cantap_wire::{CHANNELS, Channel, Frame};
+
+use crate::bits::{FrameBits, INTERMISSION_BITS};
+use crate::device::Transmission;
+use crate::transmit::Stream;
+use crate::{Device, DeviceError};
+
+/// From now to the first frame: time to fill the device's queue.
+const LEAD: Duration = Duration::from_millis(100);
+
+/// How to change the trace's times.
+#[derive(Clone, Copy, Debug)]
+pub struct Pace {
+    /// 2 plays twice as fast, 0.5 at half the speed.
+    pub speed: f64,
+    /// Longer pauses are shortened to this.
+    pub longest_gap: Option<Duration>,
+    /// Frames begin at least so long after each other, on all channels together.
+    pub shortest_gap: Duration,
+    /// As fast as the bus takes them.
+    pub ignore_times: bool,
+}
+
+impl Default for Pace {
+    fn default() -> Self {
+        Self { speed: 1.0, longest_gap: None, shortest_gap: Duration::ZERO, ignore_times: false }
+    }
+}
+
+/// Turns times of a trace into times of the device.
+#[derive(Clone, Debug)]
+pub struct Timetable {
+    pace: Pace,
+    bitrates_bps: [u32; CHANNELS],
+    tick_ns: f64,
+    first_ticks: u64,
+    /// Begin of the last frame in the trace and in the replay, in ns since the first.
+    last: Option<(i64, f64)>,
+}
+
+impl Timetable {
+    /// The first frame begins at `first_ticks` of the device's clock.
+    pub fn new(pace: Pace, bitrates_bps: [u32; CHANNELS], tick_hz: u32, first_ticks: u64) -> Self {
+        Self { pace, bitrates_bps, tick_ns: 1e9 / f64::from(tick_hz), first_ticks, last: None }
+    }
+
+    /// A frame's time on the bus without intermission, in ns.
+    fn length_ns(&self, channel: Channel, frame: &Frame) -> f64 {
+        let bits = FrameBits::of(frame).total() - INTERMISSION_BITS;
+        f64::from(bits) * 1e9 / f64::from(self.bitrates_bps[channel.index()].max(1))
+    }
+
+    /// When a frame that ended at `end_ns` in the trace begins, and when it will end, in ticks.
+    pub fn next(&mut self, end_ns: i64, channel: Channel, frame: &Frame) -> (u64, u64) {
+        let length_ns = self.length_ns(channel, frame);
+        let begin_ns = end_ns - length_ns.round() as i64;
+        let at_ns = self.last.map_or(0.0, |(last_ns, last_at_ns)| {
+            // Negative where the other channel's shorter frame ended first.
+            let mut gap_ns = (begin_ns - last_ns) as f64;
+            if let Some(longest) = self.pace.longest_gap {
+                gap_ns = gap_ns.min(longest.as_nanos() as f64);
+            }
+            gap_ns /= self.pace.speed;
+            if !self.pace.shortest_gap.is_zero() {
+                gap_ns = gap_ns.max(self.pace.shortest_gap.as_nanos() as f64);
+            }
+            last_at_ns + gap_ns
+        });
+        self.last = Some((begin_ns, at_ns));
+        // Whole ticks first: a float does not hold a long uptime's nanoseconds.
+        let ticks = |ns: f64| self.first_ticks.saturating_add_signed((ns / self.tick_ns).round() as i64);
+        (ticks(at_ns), ticks(at_ns + length_ns))
+    }
+}
+
+/// How well a replay kept its times.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Accuracy {
+    /// Frames compared.
+    pub frames: u64,
+    /// How much earlier than planned a frame ended, at most, against the first one, in µs.
+    pub early_us: f64,
+    /// How much later, at most, in µs. A bus that was busy makes frames late.
+    pub late_us: f64,
+}
+
+/// A replay under way.
+pub struct Replay<'d> {
+    stream: Stream<'d>,
+    timetable: Timetable,
+    tick_hz: u32,
+    /// Planned ends of what is under way, per channel.
+    planned: [VecDeque<(u32, u64)>; CHANNELS],
+    /// Lateness of the first frame, in ticks, which all others are compared with.
+    first_late: Option<i64>,
+    accuracy: Accuracy,
+}
+
+impl<'d> Replay<'d> {
+    /// A replay on channels that are open at these bit rates.
+    pub fn new(device: &'d Device, pace: Pace, bitrates_bps: [u32; CHANNELS]) -> Result<Self, DeviceError> {
+        let tick_hz = device.hello().tick_hz;
+        let lead = (LEAD.as_secs_f64() * f64::from(tick_hz)) as u64;
+        let timetable = Timetable::new(pace, bitrates_bps, tick_hz, device.time()? + lead);
+        Ok(Self {
+            stream: Stream::new(device),
+            timetable,
+            tick_hz,
+            planned: Default::default(),
+            first_late: None,
+            accuracy: Accuracy::default(),
+        })
+    }
+
+    /// Adds the trace's next frame. Waits while the device's queue is full; returns false if `go_on` said no meanwhile.
+    pub fn push(
+        &mut self,
+        end_ns: i64,
+        channel: Channel,
+        frame: Frame,
+        go_on: impl FnMut() -> bool,
+    ) -> Result<bool, DeviceError> {
+        let (begin, end) = self.timetable.next(end_ns, channel, &frame);
+        let ignore_times = self.timetable.pace.ignore_times;
+        let at = (!ignore_times).then_some(begin);
+        let Some(tag) = self.stream.push(channel, frame, at, go_on)? else { return Ok(false) };
+        if !ignore_times {
+            self.planned[channel.index()].push_back((tag, end));
+        }
+        Ok(true)
+    }
+
+    /// Waits for the rest; see [`Stream::finish`].
+    pub fn finish(&mut self, go_on: impl FnMut(Duration) -> bool) -> Result<bool, DeviceError> {
+        self.stream.finish(go_on)
+    }
+
+    /// Frames handed over that have not ended.
+    pub fn under_way(&self) -> usize {
+        self.stream.under_way()
+    }
+
+    /// How frames ended since the last call.
+    pub fn take_ended(&mut self) -> Vec<Transmission> {
+        let ended = self.stream.take_ended();
+        for end in &ended {
+            let planned = &mut self.planned[end.channel.index()];
+            // What failed was not at its time; what was sent is found in order.
+            while let Some((tag, at)) = planned.pop_front() {
+                if tag == end.tag {
+                    if end.result.is_ok() {
+                        self.compare(end.ticks, at);
+                    }
+                    break;
+                }
+            }
+        }
+        ended
+    }
+
+    fn compare(&mut self, ticks: u64, planned: u64) {
+        let late = ticks.wrapping_sub(planned) as i64;
+        let first = *self.first_late.get_or_insert(late);
+        let off_us = (late - first) as f64 * 1e6 / f64::from(self.tick_hz);
+        self.accuracy.frames += 1;
+        self.accuracy.late_us = self.accuracy.late_us.max(off_us);
+        self.accuracy.early_us = self.accuracy.early_us.max(-off_us);
+    }
+
+    /// How well the times were kept so far.
+    pub const fn accuracy(&self) -> Accuracy {
+        self.accuracy
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const CAN1: Channel = Channel::Can1;
+
+    fn table(pace: Pace) -> Timetable {
+        Timetable::new(pace, [1_000_000, 500_000], 12_000_000, 1_000)
+    }
+
+    fn frame(text: &str) -> Frame {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn frames_end_as_far_apart_as_in_the_trace_whatever_their_lengths() {
+        let mut table = table(Pace::default());
+        let (short, long) = (frame("555#"), frame("1F334455#1122334455667788"));
+        let ends: Vec<u64> = [(1_000_000, short), (1_300_000, long), (1_500_000, short)]
+            .iter()
+            .map(|(end_ns, frame)| table.next(*end_ns, CAN1, frame).1)
+            .collect();
+        assert_eq!([ends[1] - ends[0], ends[2] - ends[1]], [3_600, 2_400]);
+    }
+
+    #[test]
+    fn speed_and_gaps_change_the_spacing() {
+        let begins = |pace| {
+            let mut table = table(pace);
+            [0, 1_000_000, 11_000_000].map(|end_ns| table.next(end_ns, CAN1, &frame("555#")).0 - 1_000)
+        };
+        assert_eq!(begins(Pace::default()), [0, 12_000, 132_000]);
+        assert_eq!(begins(Pace { speed: 2.0, ..Pace::default() }), [0, 6_000, 66_000]);
+        let longest_gap = Some(Duration::from_millis(2));
+        assert_eq!(begins(Pace { longest_gap, ..Pace::default() }), [0, 12_000, 36_000]);
+        let shortest_gap = Duration::from_millis(5);
+        assert_eq!(begins(Pace { shortest_gap, ..Pace::default() }), [0, 60_000, 180_000]);
+    }
+}

@@ -124,6 +124,8 @@ pub struct App {
     pub time_mode: TimeMode,
     /// The trace's selected record by number; the newest without.
     pub cursor: Option<u64>,
+    /// Number of the first record below the trace's page, as last drawn.
+    pub bottom: u64,
     /// What was last looked for.
     pub search: String,
     /// The fixed view's column that rows are sorted by.
@@ -179,6 +181,7 @@ impl App {
             frozen: None,
             time_mode: TimeMode::Relative,
             cursor: None,
+            bottom: 0,
             search: String::new(),
             sort: fixed::Column::Id,
             reverse: false,

@@ -6,6 +6,8 @@ pub mod model;
 pub mod profile;
 mod recorder;
 pub mod source;
+#[cfg(test)]
+mod tests;
 pub mod theme;
 pub mod views;
 

@@ -118,7 +118,6 @@ fn line(row: &Row, now_ns: i64, ascii: bool, app: &App, model: &Model) -> Line<'
     let theme = app.theme;
     let base = if row.mark > 0 { theme.series(usize::from(row.mark) - 1) } else { Style::new() };
     let period = row.period_ns.map_or("–".to_owned(), |ns| format!("{:.3}", ns / 1e6));
-    let period = if theme.unicode { period } else { period.replace('–', "-") };
     let jitter = row.period_ns.map_or(String::new(), |_| format!("{:.3}", row.jitter_ns / 1e6));
     let mut spans = vec![Span::styled(
         format!(

@@ -18,6 +18,14 @@ fn is_digital(row: &SignalRow, model: &Model) -> bool {
     signal.digital.is_some() || signal.length == 1
 }
 
+/// The signal's name; with its channel where another chosen one has the same.
+fn name(row: &SignalRow, model: &Model) -> String {
+    let own = &model.signals.signal(row).name;
+    let others = model.signals.rows().iter().filter(|other| other.chosen && !std::ptr::eq(*other, row));
+    let same = others.into_iter().any(|other| model.signals.signal(other).name == *own);
+    if same { format!("{}:{own}", row.channel) } else { own.clone() }
+}
+
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let chosen: Vec<_> = model.signals.rows().iter().filter(|row| row.chosen).collect();
@@ -113,10 +121,10 @@ fn analogue(
     }
     let margin = if high > low { (high - low) * 0.06 } else { low.abs().max(1.0) * 0.05 };
     let range = [low - margin, high + margin];
-    let mut title = vec![Span::raw(format!(" {label} {}…{} ", short(low), short(high)))];
+    let mut title = vec![Span::raw(format!(" {label} {} to {} ", short(low), short(high)))];
     for (index, row) in rows.iter().enumerate() {
         let value = window.value(row).unwrap_or(row.value);
-        let text = format!("{} {}  ", model.signals.signal(row).name, short(value));
+        let text = format!("{} {}  ", name(row, model), short(value));
         title.push(Span::styled(text, app.theme.series(first_colour + index)));
     }
     let colour = |style: Style| style.fg.unwrap_or_default();
@@ -188,7 +196,7 @@ fn lane(
     let style = app.theme.series(colour);
     let line: String = seen.into_iter().map(|level| symbols[level]).collect();
     let text = vec![
-        Line::from(format!(" {} {}", signal.name, model.signals.text(row))).style(style),
+        Line::from(format!(" {} {}", name(row, model), model.signals.text(row))).style(style),
         Line::from(line).style(style),
     ];
     frame.render_widget(Paragraph::new(text), area);

@@ -10,7 +10,7 @@ use super::super::theme::Theme;
 const KEYS: [(&str, &str); 19] = [
     ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send, record"),
     ("q, Ctrl-C", "leave"),
-    ("Space", "stop and go on with the display (send page: an entry on or off)"),
+    ("Space", "stop the display, go on; send: the entry on or off"),
     ("c", "clear"),
     ("t", "times: relative, delta, absolute"),
     ("f", "show only some frames, by filters in candump's syntax"),

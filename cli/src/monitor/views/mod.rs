@@ -10,6 +10,7 @@ pub mod statistics;
 pub mod trace;
 
 use ratatui::Frame;
+use ratatui::buffer::Buffer;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
@@ -51,13 +52,37 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     if app.help {
         help::draw(frame, area);
     }
+    if !app.theme.unicode {
+        make_ascii(frame.buffer_mut());
+    }
+}
+
+/// Replaces what a terminal without Unicode cannot show.
+fn make_ascii(buffer: &mut Buffer) {
+    for cell in &mut buffer.content {
+        let plain = match cell.symbol() {
+            symbol if symbol.is_ascii() => continue,
+            "─" | "–" => "-",
+            "│" => "|",
+            "┌" | "┐" | "└" | "┘" => "+",
+            "▸" | "→" => ">",
+            "←" => "<",
+            "↑" => "^",
+            "↓" => "v",
+            "×" => "x",
+            "µ" => "u",
+            "…" => ".",
+            "•" => "*",
+            _ => "?",
+        };
+        cell.set_symbol(plain);
+    }
 }
 
 fn tabs(app: &App) -> Line<'static> {
     let mut spans = vec![Span::raw(" ")];
     for (index, view) in View::ALL.into_iter().enumerate() {
         let text = format!("{}{}{} ", index + 1, if view == app.view { '▸' } else { ' ' }, view.title());
-        let text = if app.theme.unicode { text } else { text.replace('▸', ">") };
         let style = if view == app.view { Theme::heading() } else { ratatui::style::Style::new() };
         spans.push(Span::styled(text, style));
     }
@@ -139,13 +164,7 @@ fn bottom_line(app: &App, model: &Model) -> Line<'static> {
         SourceState::Playing { .. } => "  , . speed  p stop  > step  l loop",
         _ => "",
     };
-    let line = format!(" h help  q quit  {keys}{playback}  Space pause  c clear");
-    Line::from(if app.theme.unicode { line } else { ascii(&line) })
-}
-
-/// Arrows for terminals without them.
-fn ascii(text: &str) -> String {
-    text.replace("↑↓", "Up/Down").replace("← →", "Left/Right")
+    Line::from(format!(" h help  q quit  {keys}{playback}  Space pause  c clear"))
 }
 
 /// A number of bytes for people.

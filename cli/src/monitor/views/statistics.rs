@@ -117,7 +117,7 @@ fn channel_lines(
         let bars: String = windows
             .iter()
             .skip(first)
-            .map(|window| levels[((window.load_pct.unwrap_or(0.0) * 8.0 / 100.0).round() as usize).min(8)])
+            .map(|window| levels[((window.load_pct.unwrap_or(0.0) * 8.0 / 100.0).ceil() as usize).min(8)])
             .collect();
         lines.push(Line::from(vec![Span::raw("History   "), Span::styled(bars, theme.series(0))]));
     }
@@ -131,12 +131,17 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
     let percent = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1} %"));
     let work = channel.load.as_ref();
     let peak = channel.window_extremes_pct().map(|(_, _, max)| max);
-    let bound = if channel.losses.total() > 0 { " (lower bound)" } else { "" };
+    // What was lost is not in it.
+    let bound = match (channel.losses.total(), app.theme.unicode) {
+        (0, _) => "",
+        (_, true) => "≥ ",
+        (_, false) => ">= ",
+    };
     Line::from(vec![
         Span::raw("Load      "),
         Span::styled(bar, app.theme.load(load)),
         Span::raw(format!(
-            " {load:.1} %{bound}  instant {}  mean {}  peak {}",
+            " {bound}{load:.1} %  instant {}  mean {}  peak {}",
             percent(work.and_then(cantap::stats::WorkLoad::instant_pct)),
             percent(work.and_then(cantap::stats::WorkLoad::mean_pct)),
             percent(peak)

@@ -36,11 +36,17 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         // What was looked at has made room.
         app.cursor = Some(first);
     }
-    let bottom = match app.cursor {
-        // In the middle, so that there is something to see on both sides.
-        Some(cursor) => (cursor + rows / 2 + 1).clamp(end.min(first + rows), end),
+    app.bottom = match app.cursor {
         None => end,
+        // The page stands still until the selected record leaves it.
+        Some(cursor) if (app.bottom.saturating_sub(rows)..app.bottom).contains(&cursor) => app.bottom,
+        Some(cursor) if cursor + 1 == app.bottom.saturating_sub(rows) => cursor + rows,
+        Some(cursor) if cursor == app.bottom => cursor + 1,
+        // Far away: into the middle, so that there is something to see on both sides.
+        Some(cursor) => cursor + rows / 2 + 1,
     };
+    app.bottom = app.bottom.clamp(end.min(first + rows), end);
+    let bottom = app.bottom;
     let top = bottom.saturating_sub(rows).max(first);
     let (used, most) = history.memory();
     let width = usize::from(area.width);

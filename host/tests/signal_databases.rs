@@ -132,7 +132,7 @@ fn a_fault_in_a_signal_file_names_line_and_symbol() {
 #[test]
 fn a_fault_in_a_dbc_file_names_line_and_symbol() {
     let signal = |text: &str| {
-        format!("VERSION \"\"\n\nBO_ 5 Engine: 8 A\n SG_ Ok : 0|8@1+ (1,0) [0|0] \"\" A\n{text}\n")
+        format!("VERSION \"\"\n\nBO_ 5 Engine: 8 A\n SG_ Ok : 0|8@1+ (1,-1) [0|0] \"\" A\n{text}\n")
     };
     for (text, expected) in [
         (

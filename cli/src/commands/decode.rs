@@ -34,8 +34,9 @@ pub struct Args {
     input: Option<PathBuf>,
     #[command(flatten)]
     live: LiveArgs,
-    /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Can be repeated.
-    #[arg(short, long = "signal", value_name = "PATTERN")]
+    /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Several with commas, or
+    /// repeated.
+    #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',')]
     signals: Vec<String>,
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]

@@ -90,11 +90,16 @@ fn form(keyword: &str) -> Option<&'static str> {
 
 /// The line of can-dbc's error and what it says, in words.
 fn explain(error: &DbcError, text: &str) -> (u32, String) {
+    // can-dbc says which number is wrong and not where. A signal's place goes before other numbers,
+    // because nothing else may not be negative.
     let line_of = |token: &str| {
-        let quoted = text.lines().position(|line| {
-            line.split(|c: char| !(c.is_ascii_alphanumeric() || "+-._".contains(c))).any(|word| word == token)
-        });
-        quoted.map_or(0, |line| line as u32 + 1)
+        let (start, length) = (format!(": {token}|"), format!("|{token}@"));
+        let is_word = |line: &str| {
+            let mut words = line.split(|c: char| !(c.is_ascii_alphanumeric() || "+-._".contains(c)));
+            words.any(|word| word == token)
+        };
+        let place = text.lines().position(|line| line.contains(&start) || line.contains(&length));
+        place.or_else(|| text.lines().position(is_word)).map_or(0, |line| line as u32 + 1)
     };
     match error {
         DbcError::Pest(error) => {

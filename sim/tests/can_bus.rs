@@ -342,6 +342,34 @@ fn synchronisation_waits_for_a_full_bus_to_pause() {
 }
 
 #[test]
+fn a_frame_wakes_a_sleeping_controller() {
+    const SLEEP: u32 = 1 << 1;
+    const AWUM: u32 = 1 << 5;
+    for automatic in [false, true] {
+        let mut bench = Bench::new(&[0]);
+        let mcr = if automatic { AWUM } else { 0 };
+        bench.start(0, mcr, MEGABIT | SILENT);
+        bench.write(IER, 1 << 16 | 1 << 17);
+        bench.write(MCR, mcr | SLEEP);
+        assert_eq!(bench.read(MSR) & 0b1_0010, 0b1_0010, "SLAK, SLAKI");
+        bench.write(MSR, 1 << 4);
+        assert!(!bench.can.irqs(0)[3]);
+        let sender = bench.add_peer();
+        bench.add_peer();
+        for at in [bench.now, bench.now + MS] {
+            bench.wire.node(sender).send_at(at, frame("123#"));
+        }
+        bench.run(2 * MS);
+        assert_eq!(bench.read(MSR) >> 3 & 1, 1, "WKUI");
+        assert!(bench.can.irqs(0)[3]);
+        // The frame that wakes it is lost on it; the next one is not.
+        let taken: Vec<u8> = bench.wire.history().iter().map(|frame| frame.taken_by).collect();
+        assert_eq!(taken, if automatic { [0, 1] } else { [0, 0] });
+        assert_eq!(bench.read(MSR) >> 1 & 1, u32::from(!automatic), "SLAK");
+    }
+}
+
+#[test]
 fn a_stuck_bus_keeps_a_controller_from_synchronising() {
     let mut bench = Bench::new(&[0]);
     bench.wire.hold_dominant(true, &mut bench.can);

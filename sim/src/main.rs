@@ -228,6 +228,9 @@ fn print(out: &mut impl Write, report: &Report) -> io::Result<()> {
         writeln!(out, "  {name}: {entries} times, {share:.2} %")?;
     }
     writeln!(out, "emulation: {:.2} s per emulated second", report.host_s_per_emulated_s)?;
+    for odd in &report.odd_accesses {
+        writeln!(out, "odd register access: {odd}")?;
+    }
     for fault in &report.faults {
         writeln!(out, "FAULT: {fault}")?;
     }

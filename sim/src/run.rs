@@ -12,7 +12,7 @@ use crate::capture::{Losses, Stamps};
 use crate::elf::Image;
 use crate::machine::{Machine, Setup};
 use crate::rig::{MS, Rig, RigError};
-use crate::soc::CAN_IRQS;
+use crate::soc::{CAN_IRQS, OddAccess};
 use crate::trace::Trace;
 use crate::traffic::{Kind, Script, Traffic};
 use crate::usb_host::Timing;
@@ -123,6 +123,8 @@ pub struct Report {
     pub tasks: Vec<(String, u64, f64)>,
     /// What broke the law of counting.
     pub faults: Vec<String>,
+    /// Accesses to registers that no model knows, or that the hardware would not take.
+    pub odd_accesses: Vec<OddAccess>,
     /// Whether every frame was delivered in order and bit for bit, or counted lost where it is missing.
     pub ok: bool,
 }
@@ -193,6 +195,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
         host_s_per_emulated_s: took / seconds,
         tasks: costs.tasks,
         ok: faults.is_empty() && rig.ledger.holds(),
+        odd_accesses: rig.machine.board().odd_accesses(),
         faults,
     };
     Ok((report, trace.map(|trace| (rig.machine, trace))))

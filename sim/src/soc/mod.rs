@@ -7,6 +7,7 @@ pub mod small;
 pub mod timer;
 
 use std::collections::BTreeMap;
+use std::fmt;
 use std::ops::Range;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
@@ -54,6 +55,18 @@ pub struct OddAccess {
     pub write: bool,
     /// How often.
     pub count: u64,
+}
+
+impl fmt::Display for OddAccess {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kind = if self.write { "write" } else { "read" };
+        let reason = match self.oddity {
+            Oddity::Unknown => "no model knows it",
+            Oddity::Unclocked => "its peripheral's clock is off",
+            Oddity::Refused => "the hardware does not take it now",
+        };
+        write!(f, "{kind} of {:#010x}, {} times: {reason}", self.address, self.count)
+    }
 }
 
 struct Device {

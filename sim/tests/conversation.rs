@@ -198,7 +198,7 @@ fn unknown_control_requests_are_refused_and_harm_nothing() {
     let Some(mut rig) = connected() else { return };
     for (kind, request) in [(0xC0, 1), (0xA1, 0x77), (0x40, 9), (0x80, 6), (0x21, 0x23)] {
         rig.with_host(|host, _| {
-            host.control(UsbRequest::new(kind, request, 0x4200, 0, if kind & 0x80 == 0 { 0 } else { 8 }))
+            host.control(UsbRequest::new(kind, request, 0x4200, 0, if kind & 0x80 == 0 { 0 } else { 8 }));
         });
         rig.run_for(10 * MS).unwrap();
         let outcome = rig.with_host(|host, _| host.control_outcome());

@@ -1,4 +1,3 @@
-#![allow(dead_code, reason = "each test uses its part")]
 //! The firmware that the tests run: what `cargo xtask firmware` built.
 #![allow(dead_code, reason = "each test file uses its part")]
 

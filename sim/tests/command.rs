@@ -130,3 +130,35 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
     exchange(&[], &mut |_, frames| frames >= 50);
     assert_eq!(session.corruptions(), []);
 }
+
+/// Served on a pseudo-terminal, it is a serial port like any other.
+#[cfg(unix)]
+#[test]
+fn a_pty_is_announced_by_its_name_and_answers() {
+    use std::fs::File;
+    use std::io::{BufRead, BufReader, Read, Write};
+    use std::process::Stdio;
+
+    let Some(elf) = common::elf() else { return };
+    let mut server = Command::new(env!("CARGO_BIN_EXE_cantap-sim"))
+        .args(["run", elf.to_str().unwrap(), "--pty", "--seconds", "2", "--load", "0"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut name = String::new();
+    BufReader::new(server.stdout.take().unwrap()).read_line(&mut name).unwrap();
+    let mut port = File::options().read(true).write(true).open(name.trim()).unwrap();
+    let mut session = Session::new();
+    let (id, hello) = session.hello();
+    port.write_all(&hello).unwrap();
+    let mut piece = [0; 512];
+    let response = loop {
+        let len = port.read(&mut piece).unwrap();
+        session.take(&piece[..len], |_| {});
+        if let Some(response) = session.response(id) {
+            break response;
+        }
+    };
+    assert!(matches!(response.result, Ok(Reply::Hello(_))), "{response:?}");
+    assert_eq!(server.wait().unwrap().code(), Some(0));
+}

@@ -95,7 +95,8 @@ impl Machine {
         }
     }
 
-    /// The chip and what is wired to it. Not to be held across [`Self::run_until`].
+    /// The chip and what is wired to it. It is locked as long as the guard lives: hold one at a time, and none
+    /// across [`Self::run_until`].
     pub fn board(&self) -> MutexGuard<'_, Board> {
         lock(&self.board)
     }

@@ -9,6 +9,7 @@ pub mod bits;
 pub mod node;
 pub mod outcome;
 pub mod sampling;
+mod start;
 
 use std::collections::VecDeque;
 
@@ -17,10 +18,9 @@ use cantap_wire::record::BusErrorKind;
 
 use crate::can::fault::Counters;
 use crate::can::{CanPair, Mode};
-use bits::FrameBits;
 pub use node::{BitTime, Node, Source};
+use outcome::Detection;
 pub use outcome::Disturbance;
-use outcome::{Detection, Outcome, Participant};
 
 /// Recessive bits after which a node may take part, and of which bus-off needs 128 sequences.
 const SYNC_BITS: u64 = 11;
@@ -265,176 +265,6 @@ impl Wire {
         }
     }
 
-    fn start_frame(&mut self, can: &mut CanPair) {
-        let start = self.now;
-        let mut contenders: Vec<(Member, Frame, FrameBits)> = self
-            .members()
-            .filter_map(|member| {
-                let (due, frame) = self.wants(member, can)?;
-                (due <= start).then(|| (member, frame, FrameBits::new(&frame)))
-            })
-            .collect();
-        let Some(bit) = contenders.first().map(|(member, ..)| self.bit_of(*member, can)) else { return };
-        contenders.retain(|(member, ..)| self.bit_of(*member, can).agrees_with(&bit));
-        let winner = (1..contenders.len()).fold(0, |best, other| {
-            if beats(&contenders[other].2, &contenders[best].2) { other } else { best }
-        });
-        let (sender, frame, bits) = contenders.swap_remove(winner);
-        let bit = self.bit_of(sender, can);
-
-        let mut twins = Vec::new();
-        let mut losers = Vec::new();
-        let mut collided = Vec::new();
-        for (member, _, own) in &contenders {
-            match first_difference(own, &bits) {
-                None => twins.push(*member),
-                Some(at) if at < own.arbitration_end() => losers.push((*member, at)),
-                Some(at) => collided.push((*member, at)),
-            }
-        }
-        self.count_recovery(can, start);
-        for n in self.attached.clone() {
-            let own = Member::Controller(n);
-            let sends = sender == own || contenders.iter().any(|(member, ..)| *member == own);
-            can.controllers[n].start_of_frame(sends, start);
-        }
-
-        // Everybody who listens takes part: the sender, its twins, those who collide with it, receivers.
-        let mut members = vec![sender];
-        members.extend(&twins);
-        let senders = members.len();
-        members.extend(collided.iter().map(|(member, _)| *member));
-        let receivers: Vec<Member> = self
-            .members()
-            .filter(|member| !members.contains(member))
-            .filter(|member| listens(*member, can) && self.understands(*member, bit))
-            .collect();
-        members.extend(&receivers);
-        let participants: Vec<Participant> = members
-            .iter()
-            .enumerate()
-            .map(|(position, member)| {
-                let collision = collided.iter().find(|(other, _)| other == member);
-                let own = match collision {
-                    Some((_, at)) => Some((*at, BusErrorKind::BitRecessive)),
-                    None if position < senders => None,
-                    None => self.misheard(*member, &bits, bit, can),
-                };
-                let (acknowledges, flags) = self.abilities(*member, can);
-                Participant { sender: position < senders, acknowledges, flags, own }
-            })
-            .collect();
-        let disturbance = self.take_disturbance();
-        let outcome = Outcome::of(&bits, &participants, disturbance);
-        count_dominant(&bits, &members, &participants, &outcome, &losers, &collided, can);
-
-        let at = |bits: usize| start + bit.cycles(bits as u64);
-        let mut steps: Vec<(u64, Step)> =
-            losers.iter().map(|(member, bit)| (at(bit + 1), Step::LoseArbitration(*member))).collect();
-        for detection in &outcome.detections {
-            let sends = detection.who < senders || collided.iter().any(|(m, _)| *m == members[detection.who]);
-            steps.push((at(detection.bit + 1), Step::Error(members[detection.who], sends, *detection)));
-        }
-        let error = outcome.of_participant(0).map(|detection| detection.kind);
-        let good = |who: usize| outcome.of_participant(who).is_none();
-        let takers: Vec<usize> = (0..members.len())
-            .filter(|who| !participants[*who].sender && good(*who))
-            .filter_map(|who| match members[who] {
-                Member::Controller(n) => Some(n),
-                Member::Node(n) => {
-                    self.nodes[n].counters.received();
-                    None
-                }
-            })
-            .collect();
-        let finish = if error.is_none() { bits.len() } else { outcome.free_after };
-        steps.push((at(bits.valid_after()), Step::Receive));
-        steps.push((at(finish), Step::Finish));
-        steps.sort_by_key(|(time, _)| *time);
-        self.flight = Some(Flight {
-            sender,
-            twins,
-            frame,
-            start,
-            valid: at(bits.valid_after()),
-            end: at(bits.len()),
-            free: at(outcome.free_after),
-            recessive: at(outcome.recessive_from),
-            error,
-            bit,
-            receivers: takers,
-            taken_by: 0,
-            steps: steps.into(),
-        });
-        self.started += 1;
-    }
-
-    /// Simulated nodes of another bit rate than the frame's are left out of it: only the emulated controllers are
-    /// shown what a wrong bit rate looks like.
-    fn understands(&self, member: Member, bit: BitTime) -> bool {
-        match member {
-            Member::Controller(_) => true,
-            Member::Node(n) => self.nodes[n].bit.agrees_with(&bit),
-        }
-    }
-
-    /// Whether a member acknowledges, and whether it flags errors with dominant bits.
-    fn abilities(&self, member: Member, can: &CanPair) -> (bool, bool) {
-        match member {
-            Member::Controller(n) => {
-                let controller = &can.controllers[n];
-                (controller.answers(), controller.answers() && !controller.counters().passive())
-            }
-            Member::Node(n) => {
-                let node = &self.nodes[n];
-                let sends = node.wanted().is_some();
-                (node.acknowledges, (node.acknowledges || sends) && !node.counters.passive())
-            }
-        }
-    }
-
-    /// The error that a receiver of another bit rate sees, and at which bit of the sender's.
-    fn misheard(
-        &self,
-        member: Member,
-        bits: &FrameBits,
-        bit: BitTime,
-        can: &CanPair,
-    ) -> Option<(usize, BusErrorKind)> {
-        let Member::Controller(n) = member else { return None };
-        if self.bit_of(member, can).agrees_with(&bit) {
-            return None;
-        }
-        let mut levels = bits.levels().to_vec();
-        levels[bits.ack_slot()] = false;
-        let timing = can.controllers[n].timing();
-        match sampling::listen(&levels, |n| bit.cycles(n as u64), &timing) {
-            sampling::Heard::Frame => None,
-            sampling::Heard::Error { after, kind } => {
-                let at = (0..bits.len()).take_while(|n| bit.cycles(*n as u64 + 1) < after).count();
-                Some((at.min(bits.len() - 2), kind))
-            }
-        }
-    }
-
-    fn take_disturbance(&mut self) -> Option<Disturbance> {
-        self.disturbances
-            .pop_front_if(|(frame, _)| *frame <= self.started)
-            .map(|(_, disturbance)| disturbance)
-    }
-
-    /// Sequences of eleven recessive bits since the last frame, for controllers in bus-off.
-    fn count_recovery(&self, can: &mut CanPair, start: u64) {
-        for n in &self.attached {
-            let controller = &mut can.controllers[*n];
-            if let Mode::BusOff { since, .. } = controller.mode() {
-                let from = since.max(self.recessive);
-                let sequences = start.saturating_sub(from) / (SYNC_BITS * controller.timing().bit());
-                controller.recover(sequences as u32);
-            }
-        }
-    }
-
     fn next_step(&mut self, can: &mut CanPair) {
         let Some(flight) = &mut self.flight else { return };
         let Some((_, step)) = flight.steps.pop_front() else { return };
@@ -540,53 +370,6 @@ impl Wire {
         }
         if let Some(stuck) = &mut self.stuck {
             stuck.next_error = self.now + bit.cycles(8);
-        }
-    }
-}
-
-fn first_difference(one: &FrameBits, other: &FrameBits) -> Option<usize> {
-    let length = one.len().max(other.len());
-    (0..length).find(|bit| one.levels().get(*bit) != other.levels().get(*bit))
-}
-
-/// Whether the first bit in which they differ is dominant in `one`.
-fn beats(one: &FrameBits, other: &FrameBits) -> bool {
-    first_difference(one, other).is_some_and(|bit| one.levels().get(bit) == Some(&false))
-}
-
-/// Whether a member takes part in what happens on the bus.
-fn listens(member: Member, can: &CanPair) -> bool {
-    match member {
-        Member::Controller(n) => can.controllers[n].listens(),
-        Member::Node(_) => true,
-    }
-}
-
-/// Adds what each emulated controller puts on the bus in this frame.
-fn count_dominant(
-    bits: &FrameBits,
-    members: &[Member],
-    participants: &[Participant],
-    outcome: &Outcome,
-    losers: &[(Member, usize)],
-    collided: &[(Member, usize)],
-    can: &mut CanPair,
-) {
-    for (who, member) in members.iter().enumerate() {
-        let Member::Controller(n) = *member else { continue };
-        let detection = outcome.of_participant(who);
-        let sends = participants[who].sender || collided.iter().any(|(other, _)| other == member);
-        let mut driven = 0;
-        if sends {
-            driven += bits.dominant_in(detection.map_or(bits.len(), |detection| detection.bit + 1));
-        }
-        driven += u64::from(outcome.acknowledged_by.contains(&who));
-        driven += if detection.is_some() && participants[who].flags { outcome::FLAG as u64 } else { 0 };
-        can.controllers[n].drove(driven);
-    }
-    for (member, lost_at) in losers {
-        if let Member::Controller(n) = *member {
-            can.controllers[n].drove(bits.dominant_in(*lost_at));
         }
     }
 }

@@ -209,6 +209,43 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
     assert_eq!(rig.ledger.delivered_count(Channel::Can2), 4);
 }
 
+/// What autobaud builds on: the wrong rate gives errors and no frame, and harms nobody.
+#[test]
+fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
+    let Some(image) = common::firmware() else { return };
+    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    rig.connect().unwrap();
+    for (channel, wrong) in [(Channel::Can1, 500_000), (Channel::Can2, 800_000)] {
+        rig.listen(channel, wrong).unwrap();
+    }
+    let from = rig.now();
+    for channel in BOTH {
+        rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Mix, 8, 40.0, from, from + 40 * MS));
+    }
+    rig.run_for(50 * MS).unwrap();
+    settle(&mut rig);
+    for channel in BOTH {
+        let of = |event: &Event| {
+            matches!(event, Event::BusError { channel: seen, .. } if *seen == channel)
+                || matches!(event, Event::ErrorsSuppressed { channel: seen, .. } if *seen == channel)
+        };
+        assert!(rig.events().iter().any(|(_, event)| of(event)), "{channel:?}: {:?}", rig.events());
+        assert_eq!((rig.ledger.delivered_count(channel), rig.dominant_bits(channel)), (0, 0), "{channel:?}");
+        let sender = rig.machine.board().wires[channel.index()].node(0).sent();
+        assert!(sender > 100, "{channel:?}: {sender} frames crossed the bus undisturbed");
+    }
+}
+
+/// Everything else here rests on these: the time of the bus, of the stamps and of USB.
+#[test]
+fn the_clock_tree_is_set_up_as_designed() {
+    let Some(rig) = listening() else { return };
+    let clocks = rig.machine.board().rcc.clocks();
+    assert_eq!(clocks.sysclk_hz, CYCLES_PER_SECOND);
+    assert_eq!((clocks.pclk1_hz, clocks.usb_hz), (36_000_000, 48_000_000));
+    assert_eq!(clocks.cycles_per_timer_clock, 2, "72 MHz");
+}
+
 /// A firmware that cannot get at its FIFOs in time loses frames, and says so.
 #[test]
 fn a_forced_overrun_is_counted() {

@@ -211,6 +211,8 @@ impl App {
     /// A key was pressed.
     pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
         self.message.clear();
+        // Whoever presses a key has read it.
+        model.notice.clear();
         if key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c') {
             return Flow::Quit;
         }

@@ -88,6 +88,8 @@ const WAIT: Duration = Duration::from_millis(20);
 const FIGURES_EVERY: Duration = Duration::from_millis(500);
 /// How long after it was gone a device is tried again.
 const RETRY_AFTER: Duration = Duration::from_secs(1);
+/// A window is closed so long after its end although nothing came, so that a late frame finds it open.
+const LATENESS_NS: i64 = 1_000_000_000;
 /// Records handed over under one lock in playback.
 const MOST_AT_ONCE: usize = 4096;
 
@@ -185,7 +187,11 @@ impl Source<'_> {
                     continue;
                 }
                 Ok(_) => return,
-                Err(error) => lock(self.model).source = SourceState::Gone(error.to_string()),
+                Err(error) => {
+                    let mut model = lock(self.model);
+                    model.source = SourceState::Gone(error.to_string());
+                    model.statistics.interrupt();
+                }
             }
             // The device may come back, and the user may choose another one meanwhile.
             let retry_at = Instant::now() + RETRY_AFTER;
@@ -248,7 +254,7 @@ impl Source<'_> {
                     figures.clock = Some(device.clock());
                 }
                 // What is still on the way must not find its window closed.
-                model.advance(clock.at(Instant::now()).saturating_sub(200_000_000));
+                model.advance(clock.at(Instant::now()).saturating_sub(LATENESS_NS));
                 drop(model);
                 self.show_recording();
             }

@@ -178,10 +178,7 @@ impl ChannelStatistics {
                 self.losses.gaps += 1;
                 self.losses.at_least |= at_least;
                 self.windows.lost(u64::from(count));
-                self.gaps = self.gaps.wrapping_add(1);
-                if let Some(load) = &mut self.load {
-                    load.gap();
-                }
+                self.interrupt();
             }
             TraceEvent::TransmitFailed { .. } => self.transmit_failures += 1,
         }
@@ -217,6 +214,14 @@ impl ChannelStatistics {
         }
         self.windows.frame(end_ns, bits, closed);
         self.ids.add(frame, direction, bits, end_ns, self.gaps);
+    }
+
+    /// The interval from the last frame to the next one says nothing.
+    pub(super) fn interrupt(&mut self) {
+        self.gaps = self.gaps.wrapping_add(1);
+        if let Some(load) = &mut self.load {
+            load.gap();
+        }
     }
 
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {

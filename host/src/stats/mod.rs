@@ -150,6 +150,12 @@ impl Statistics {
         self.channels.len() - 1
     }
 
+    /// Nothing is known about the time from here to the next record, as while a device was gone: no interval
+    /// that spans it counts for load or period.
+    pub fn interrupt(&mut self) {
+        self.channels.iter_mut().for_each(ChannelStatistics::interrupt);
+    }
+
     /// Time has come to `now_ns` without a record: windows that are over by then are closed.
     pub fn advance_with(&mut self, now_ns: i64, mut closed: impl FnMut(&Window)) {
         self.last_ns = if self.channels.is_empty() { self.last_ns } else { self.last_ns.max(now_ns) };

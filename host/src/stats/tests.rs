@@ -94,6 +94,21 @@ fn options_that_cannot_work_are_refused_with_the_reason() {
     assert_eq!(Statistics::new(zero).unwrap_err(), BadOptions::ZeroBitrate);
 }
 
+#[test]
+fn an_interruption_counts_for_neither_load_nor_period() {
+    let mut statistics = at_1_mbit();
+    for time_us in [0, 116, 232] {
+        statistics.push(&frame(time_us, 1, "000#55"));
+    }
+    statistics.interrupt();
+    for time_us in [900_000, 900_116] {
+        statistics.push(&frame(time_us, 1, "000#55"));
+    }
+    let channel = &statistics.summary().channels[0];
+    assert_eq!((channel.bus_load_pct, channel.ids[0].period_max_ms), (Some(50.0), Some(0.116)));
+    assert_eq!(channel.lost.total, 0);
+}
+
 /// Files may say anything.
 #[test]
 fn no_time_however_wild_makes_it_panic() {

@@ -15,7 +15,7 @@ use crate::interrupt;
 /// How long to wait for records before looking at clock and Ctrl-C.
 const WAIT: Duration = Duration::from_millis(100);
 /// A window is closed so long after its end, so that what is still on the way gets into it.
-const LATENESS_NS: i64 = 200_000_000;
+const LATENESS_NS: i64 = 1_000_000_000;
 /// Columns of the bar for 100 %.
 const BAR_COLUMNS: usize = 20;
 

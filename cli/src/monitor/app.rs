@@ -211,6 +211,10 @@ impl App {
     /// A key was pressed.
     pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
         self.message.clear();
+        // Autobaud may have found other bit rates.
+        for (channel, rate) in self.plan.iter_mut().flat_map(|plan| &mut plan.channels) {
+            *rate = model.options().bitrate_of(channel.number()).unwrap_or(*rate);
+        }
         // Whoever presses a key has read it.
         model.notice.clear();
         if key.modifiers.contains(KeyModifiers::CONTROL) && key.code == KeyCode::Char('c') {
@@ -259,6 +263,7 @@ impl App {
             KeyCode::Char('r') if model.recording.is_some() => self.order(Order::StopRecording),
             KeyCode::Char('r') => self.ask(PromptKind::Record, String::new()),
             KeyCode::Char('b') => self.ask_bit_rate(),
+            KeyCode::Char('A') if self.plan.is_some() => self.order(Order::Autobaud),
             KeyCode::Char('D') => {
                 let address =
                     self.plan.as_ref().map_or("virtual".to_owned(), |plan| plan.address.to_string());
@@ -490,15 +495,7 @@ impl App {
     }
 
     fn open(&mut self, plan: Plan, model: &mut Model) -> Result<(), String> {
-        let options = cantap::stats::Options {
-            bitrate_bps: None,
-            channel_bitrate_bps: plan
-                .channels
-                .iter()
-                .map(|(channel, rate)| (channel.number(), *rate))
-                .collect(),
-            ..model.options().clone()
-        };
+        let options = plan.options(model.options());
         model.set_options(options).map_err(|error| error.to_string())?;
         // A new session has no periodic entries.
         self.send.iter_mut().for_each(|entry| entry.on = false);

@@ -3,9 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use cantap::TraceRecord;
+use cantap::condition::Condition;
 use cantap::formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 
+use cantap::signals::Decoder;
+use cantap::trigger::{Trigger, Window};
+
 use super::model::Recording;
+
+/// What is kept around an event where a condition is given.
+const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000 };
+
+/// What stands between a file's name and the condition on which it is written.
+const IF: &str = " if ";
 
 /// A file that grows.
 pub struct Recorder {
@@ -13,25 +23,42 @@ pub struct Recorder {
     writer: Box<dyn TraceWriter>,
     records: u64,
     since_ns: i64,
+    trigger: Option<Trigger>,
 }
 
 impl Recorder {
-    /// Creates the file, in the format of its suffix.
-    pub fn create(path: &Path) -> anyhow::Result<Self> {
+    /// Creates the file, in the format of its suffix. Behind the name may stand a condition, as in
+    /// `fast.blf if Speed > 80`: then only what is around such events is recorded.
+    pub fn create(text: &Path, decoder: &Decoder) -> anyhow::Result<Self> {
+        let (path, trigger) = match text.to_str().and_then(|text| text.split_once(IF)) {
+            None => (text, None),
+            Some((path, condition)) => {
+                let condition = Condition::new(condition.trim(), decoder)
+                    .map_err(|error| anyhow::anyhow!("nothing is recorded: {error}"))?;
+                (Path::new(path.trim()), Some(Trigger::new(condition, WINDOW)))
+            }
+        };
         let writer = create_writer(path, &WriteOptions::default())
             .map_err(|error| anyhow::anyhow!("cannot record to {}: {error}", path.display()))?;
-        Ok(Self { path: path.to_owned(), writer, records: 0, since_ns: 0 })
+        Ok(Self { path: path.to_owned(), writer, records: 0, since_ns: 0, trigger })
     }
 
     /// Writes records.
     pub fn write(&mut self, records: &[TraceRecord]) -> std::io::Result<()> {
+        let Self { writer, trigger, records: count, since_ns, .. } = self;
+        let mut keep = |record: &TraceRecord| {
+            if *count == 0 {
+                *since_ns = record.time_ns;
+            }
+            *count += 1;
+            writer.write(record)
+        };
         for record in records {
-            self.writer.write(record)?;
+            match trigger {
+                Some(trigger) => trigger.push(record, &mut keep)?,
+                None => keep(record)?,
+            }
         }
-        if self.records == 0 {
-            self.since_ns = records.first().map_or(0, |record| record.time_ns);
-        }
-        self.records += records.len() as u64;
         Ok(())
     }
 

@@ -8,6 +8,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, TryRecvError};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use cantap::autobaud::{self, Limits, Outcome, Progress};
 use cantap::device::{Records, UtcClock};
 use cantap::filter::Filter;
 use cantap::formats::{ReadOptions, open_reader};
@@ -35,6 +36,14 @@ pub struct Plan {
     pub channels: Vec<(Channel, u32)>,
     /// How.
     pub mode: Mode,
+}
+
+impl Plan {
+    /// The statistics' options with this plan's bit rates.
+    pub fn options(&self, others: &cantap::stats::Options) -> cantap::stats::Options {
+        let rates = self.channels.iter().map(|(channel, rate)| (channel.number(), *rate));
+        cantap::stats::Options { bitrate_bps: None, channel_bitrate_bps: rates.collect(), ..others.clone() }
+    }
 }
 
 /// Where records come from.
@@ -67,6 +76,8 @@ pub enum Order {
     Step,
     /// Playback: loop or not.
     ToggleLoop,
+    /// Find the bit rates of the device's channels, only listening.
+    Autobaud,
     /// Another device, other bit rates, another mode.
     Open(Plan),
     /// Show only what one of these accepts.
@@ -78,6 +89,7 @@ pub enum Order {
 /// What becomes of the source after an order.
 enum Then {
     GoOn,
+    Autobaud,
     Reopen(Plan),
     Quit,
 }
@@ -127,7 +139,8 @@ impl Source<'_> {
 
     fn record(&mut self, path: &Path) {
         self.stop_recording();
-        match Recorder::create(path) {
+        let decoder = Arc::clone(lock(self.model).signals.decoder());
+        match Recorder::create(path, &decoder) {
             Ok(recorder) => {
                 self.recorder = Some(recorder);
                 self.notice(format!("recording to {}", path.display()));
@@ -166,6 +179,7 @@ impl Source<'_> {
             Order::StopRecording => self.stop_recording(),
             Order::Filter(filters) => lock(self.model).filters = filters,
             Order::Open(plan) => return Then::Reopen(plan),
+            Order::Autobaud => return Then::Autobaud,
             Order::Quit => return Then::Quit,
             Order::Send(..) | Order::SetPeriodic(..) => {
                 self.notice("there is no device to send with; open one with D");
@@ -186,6 +200,10 @@ impl Source<'_> {
                     reconnects = 0;
                     continue;
                 }
+                Ok(Then::Autobaud) => {
+                    plan = self.autobaud(plan);
+                    continue;
+                }
                 Ok(_) => return,
                 Err(error) => {
                     let mut model = lock(self.model);
@@ -198,7 +216,7 @@ impl Source<'_> {
             loop {
                 match self.orders.recv_timeout(retry_at.saturating_duration_since(Instant::now())) {
                     Ok(order) => match self.follow(order) {
-                        Then::GoOn => {}
+                        Then::GoOn | Then::Autobaud => {}
                         Then::Reopen(other) => {
                             plan = other;
                             break;
@@ -289,6 +307,52 @@ impl Source<'_> {
         }
     }
 
+    /// The plan with the bit rates that were found; what was not found stays as it was.
+    fn autobaud(&mut self, mut plan: Plan) -> Plan {
+        let mut said = Vec::new();
+        let device = match Device::open(&plan.address) {
+            Ok(device) => device,
+            Err(error) => {
+                self.notice(error.to_string());
+                return plan;
+            }
+        };
+        for (channel, bitrate) in &mut plan.channels {
+            let number = channel.number();
+            let mut progress = |progress: Progress| {
+                self.notice(match progress {
+                    Progress::Common { bitrate_bps, at, of } => {
+                        format!("channel {number}: common rates {}/{of}, {bitrate_bps} bit/s", at + 1)
+                    }
+                    Progress::Scan { bitrate_bps, at, of } => {
+                        format!("channel {number}: all rates {}/{of}, {bitrate_bps} bit/s", at + 1)
+                    }
+                    Progress::Checking { bitrate_bps } => {
+                        format!("channel {number}: frames at {bitrate_bps} bit/s, making sure")
+                    }
+                });
+                true
+            };
+            said.push(match autobaud::search(&device, *channel, &Limits::default(), &mut progress) {
+                Ok(Outcome::Found { bitrate_bps, .. }) => {
+                    *bitrate = bitrate_bps;
+                    format!("channel {number}: {bitrate_bps} bit/s")
+                }
+                Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
+                Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
+                Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
+                Err(error) => format!("channel {number}: {error}"),
+            });
+        }
+        let mut model = lock(self.model);
+        let options = plan.options(model.options());
+        model.notice = match model.set_options(options) {
+            Ok(()) => said.join("; "),
+            Err(error) => error.to_string(),
+        };
+        plan
+    }
+
     fn hand_over(&mut self, batch: Vec<TraceRecord>, records: &Records) {
         if !batch.is_empty() {
             self.take(&batch);
@@ -357,7 +421,7 @@ impl Source<'_> {
                 Ok(Order::TogglePause) => playback.pause(now),
                 Ok(Order::ToggleLoop) => playback.set_looped(!playback.is_looped()),
                 Ok(order) => match self.follow(order) {
-                    Then::GoOn => {}
+                    Then::GoOn | Then::Autobaud => {}
                     Then::Reopen(plan) => return self.run_device(plan),
                     Then::Quit => return,
                 },
@@ -371,7 +435,7 @@ impl Source<'_> {
     fn wait_without_source(&mut self) {
         while let Ok(order) = self.orders.recv() {
             match self.follow(order) {
-                Then::GoOn => {}
+                Then::GoOn | Then::Autobaud => {}
                 Then::Reopen(plan) => return self.run_device(plan),
                 Then::Quit => return,
             }

@@ -25,7 +25,7 @@ const KEYS: [(&str, &str); 19] = [
     ("a  e  d", "send: add, edit, delete"),
     ("m", "listen-only or normal"),
     ("r", "start or stop recording"),
-    ("b  D", "bit rates, device"),
+    ("b  A  D", "bit rates, find the bit rates by listening, device"),
     (",  .  p  >  l", "file: slower, faster, stop, one frame, loop"),
 ];
 

@@ -137,7 +137,9 @@ fn bottom_line(app: &App, model: &Model) -> Line<'static> {
         let question = match prompt.kind {
             PromptKind::Search => "search",
             PromptKind::Filter => "show only, in candump's syntax (empty: all)",
-            PromptKind::Record => "record to (.log .asc .blf .csv .trc .pcapng, with .gz or .zst)",
+            PromptKind::Record => {
+                "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, .gz .zst)"
+            }
             PromptKind::Send => "[CHANNEL:]FRAME or Message:Signal=…, then a period",
             PromptKind::BitRate => "bit rates",
             PromptKind::Device => "device",
@@ -156,7 +158,7 @@ fn bottom_line(app: &App, model: &Model) -> Line<'static> {
         View::Fixed => "s S sort  g group  # * notch  H heat  x u hide  o colour",
         View::Signals => "↑↓ select  Enter into the graph",
         View::Graph => "+ - zoom  ← → cursor  Esc no cursor",
-        View::Statistics => "b bit rate  D device",
+        View::Statistics => "b bit rate  A find it  D device",
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",
     };

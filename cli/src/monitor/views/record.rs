@@ -13,7 +13,12 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let lines = match &model.recording {
         None => vec![
             Line::from("Nothing is recorded. r starts: the file's suffix chooses the format."),
-            Line::from("Everything that comes is recorded, whatever is shown, paused or filtered here."),
+            Line::from(
+                "FILE if CONDITION, as in fast.blf if Speed > 80, keeps 2 s before and 5 s after each event.",
+            ),
+            Line::from(
+                "Otherwise everything that comes is recorded, whatever is shown, paused or filtered here.",
+            ),
         ],
         Some(recording) => {
             let seconds = model.now_ns().saturating_sub(recording.since_ns) as f64 / 1e9;

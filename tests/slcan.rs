@@ -1,0 +1,272 @@
+//! slcan conversations, pinned byte for byte, on fakes. `docs/slcan.md` lists the letters.
+
+mod fakes;
+
+use cantap_firmware::filters::Shape;
+use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
+use cantap_wire::message::Mode;
+use cantap_wire::record::{BusErrorKind, ErrorState};
+use cantap_wire::{BitTiming, Channel, Command, Frame, Reply};
+use fakes::{Bench, SMALL_QUEUE};
+
+const CAN1: Channel = Channel::Can1;
+const QUEUE: RecordQueue<SMALL_QUEUE> = RecordQueue::new();
+
+/// What the device answers to a line, frames of the bus included.
+fn say<const N: usize>(bench: &mut Bench<'_, N>, line: &str) -> String {
+    let before = bench.port.from_device.len();
+    bench.say(format!("{line}\r").as_bytes());
+    for _ in 0..3 {
+        bench.millisecond();
+    }
+    String::from_utf8(bench.port.from_device[before..].to_vec()).unwrap()
+}
+
+/// Says each line and holds the answer against what stands beside it.
+fn converse<const N: usize>(bench: &mut Bench<'_, N>, conversation: &[(&str, &str)]) {
+    for (line, answer) in conversation {
+        assert_eq!(say(bench, line), *answer, "the answer to {line:?}");
+    }
+}
+
+/// A frame comes off the bus; returns what the device sends.
+fn receive<const N: usize>(bench: &mut Bench<'_, N>, frame: &str) -> String {
+    let before = bench.port.from_device.len();
+    bench.receive(CAN1, frame.parse().unwrap());
+    bench.poll();
+    String::from_utf8(bench.port.from_device[before..].to_vec()).unwrap()
+}
+
+#[test]
+fn a_channel_is_set_up_opened_and_closed() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[
+            ("", "\r"),
+            ("C", "\r"),
+            ("O", "\x07"),
+            ("S9", "\x07"),
+            ("S", "\x07"),
+            ("S6", "\r"),
+            ("F", "\x07"),
+            ("t1230", "\x07"),
+            ("O", "\r"),
+            ("O", "\x07"),
+            ("L", "\x07"),
+            ("S4", "\x07"),
+            ("Z1", "\x07"),
+            ("F", "F00\r"),
+            ("C", "\r"),
+            ("L", "\r"),
+            ("t1230", "\x07"),
+            ("C", "\r"),
+            ("?", "\x07"),
+            ("t12", "\x07"),
+        ],
+    );
+    let modes: Vec<Mode> = bench.board.control[0].started.iter().map(|config| config.mode).collect();
+    assert_eq!(modes, [Mode::Normal, Mode::ListenOnly]);
+}
+
+#[test]
+fn each_s_digit_is_its_bit_rate() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    for (digit, rate) in [10, 20, 50, 100, 125, 250, 500, 800, 1000].iter().enumerate() {
+        converse(&mut bench, &[(&format!("S{digit}"), "\r"), ("O", "\r"), ("C", "\r")]);
+        let timing = bench.board.control[0].started[digit].timing;
+        assert_eq!(timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ), rate * 1000);
+    }
+}
+
+/// `s` takes an SJA1000's BTR0 and BTR1 at 16 MHz: 001C is 500 kbit/s with its sample point at 87.5 %.
+#[test]
+fn raw_registers_of_an_sja1000_give_its_rate_and_triple_sampling_is_refused() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[("s009C", "\x07"), ("s00", "\x07"), ("s00GG", "\x07"), ("s001C", "\r"), ("O", "\r")],
+    );
+    let timing = bench.board.control[0].started[0].timing;
+    assert_eq!(timing, BitTiming { prescaler: 9, segment1: 6, segment2: 1, jump_width: 1 });
+    converse(&mut bench, &[("s001C", "\x07"), ("C", "\r")]);
+}
+
+#[test]
+fn frames_are_sent_and_their_order_kept() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[
+            ("S8", "\r"),
+            ("O", "\r"),
+            ("t1232DEAD", "z\r"),
+            ("T1ABBCCDD0", "Z\r"),
+            ("r7FF8", "z\r"),
+            ("R000000012", "Z\r"),
+            ("t8000", "\x07"),
+            ("t1239", "\x07"),
+            ("t1232DE", "\x07"),
+            ("t1232DEADBE", "\x07"),
+            ("r123211", "\x07"),
+            ("TFFFFFFFF0", "\x07"),
+        ],
+    );
+    let sent: Vec<String> =
+        std::iter::from_fn(|| bench.send_one(CAN1)).map(|frame: Frame| frame.to_string()).collect();
+    assert_eq!(sent, ["123#DEAD", "1ABBCCDD#", "7FF#R8", "00000001#R2"]);
+}
+
+#[test]
+fn a_full_transmit_queue_is_refused_and_flagged() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
+    let taken = (0..400).take_while(|_| say(&mut bench, "t1230") == "z\r").count();
+    assert_eq!(taken, cantap_firmware::transmit::TX_QUEUE + cantap_firmware::transmit::MAILBOXES);
+    converse(&mut bench, &[("F", "F02\r"), ("F", "F00\r")]);
+}
+
+#[test]
+fn received_frames_are_lines_with_the_stamps_that_were_asked_for() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
+    assert_eq!(receive(&mut bench, "123#DEADBEEF"), "t1234DEADBEEF\r");
+    assert_eq!(receive(&mut bench, "1F334455#"), "T1F3344550\r");
+    assert_eq!(receive(&mut bench, "7FF#R3"), "r7FF3\r");
+    assert_eq!(receive(&mut bench, "00000001#R"), "R000000010\r");
+    converse(&mut bench, &[("C", "\r"), ("Z1", "\r"), ("O", "\r")]);
+    let now_ms = bench.board.clock.now.get() / TICKS_PER_MS;
+    assert_eq!(receive(&mut bench, "123#"), format!("t1230{:04X}\r", now_ms % 60_000));
+    // The stamp wraps after a minute.
+    bench.pass(60_000 * TICKS_PER_MS);
+    assert_eq!(receive(&mut bench, "123#"), format!("t1230{:04X}\r", now_ms % 60_000));
+    converse(&mut bench, &[("C", "\r"), ("Z2", "\r"), ("O", "\r")]);
+    bench.pass(7 * TICKS_PER_US);
+    let now_us = bench.board.clock.now.get() / TICKS_PER_US;
+    assert_eq!(receive(&mut bench, "123#"), format!("t1230{now_us:08X}\r"));
+    converse(&mut bench, &[("C", "\r"), ("Z0", "\r"), ("O", "\r")]);
+    assert_eq!(receive(&mut bench, "123#"), "t1230\r");
+}
+
+#[test]
+fn frames_are_polled_where_asked() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[("S8", "\r"), ("P", "\x07"), ("X0", "\r"), ("O", "\r"), ("P", "\r"), ("A", "A\r")],
+    );
+    for id in ["001#", "002#", "003#"] {
+        assert_eq!(receive(&mut bench, id), "");
+    }
+    converse(&mut bench, &[("P", "t0010\r"), ("A", "t0020\rt0030\rA\r"), ("A", "A\r"), ("t1230", "\r")]);
+}
+
+#[test]
+fn losses_and_errors_set_flags_that_reading_clears() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
+    // Four frames for a FIFO of three.
+    for _ in 0..4 {
+        bench.board.traffic[0].arrive("123#".parse().unwrap());
+    }
+    bench.interrupt(CAN1);
+    bench.poll();
+    converse(&mut bench, &[("F", "F08\r"), ("F", "F00\r")]);
+    // A host that does not read until the queue is full.
+    bench.port.takes = 0;
+    for _ in 0..5000 {
+        bench.receive(CAN1, "123#1122334455667788".parse().unwrap());
+    }
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    bench.receive(CAN1, "124#".parse().unwrap());
+    bench.millisecond();
+    converse(&mut bench, &[("F", "F01\r"), ("F", "F00\r")]);
+    bench.board.traffic[0].error = Some(BusErrorKind::Stuff);
+    bench.board.traffic[0].state = Some(ErrorState::Warning);
+    bench.millisecond();
+    converse(&mut bench, &[("F", "F84\r")]);
+    bench.board.traffic[0].state = Some(ErrorState::Passive);
+    bench.millisecond();
+    converse(&mut bench, &[("F", "F24\r"), ("F", "F00\r")]);
+}
+
+/// M and m are an SJA1000's acceptance code and mask; a mask bit of 1 does not count. With W1, one long filter.
+#[test]
+fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[("S8", "\r"), ("W1", "\r"), ("M24600000", "\r"), ("m001FFFFF", "\r"), ("O", "\r")],
+    );
+    let layout = bench.board.filters.written.last().unwrap().clone();
+    // Eleven bits from the top, compared with the format: standard ID 123.
+    let bank = layout.banks.iter().flatten().find(|bank| bank.shape == Shape::Mask16).unwrap();
+    assert_eq!((bank.first & 0xFFFF, bank.first >> 16), (0x123 << 5, 0xFFE8), "{layout:?}");
+    converse(&mut bench, &[("M00000000", "\x07"), ("mFFFFFFFF", "\x07"), ("C", "\r"), ("mFFFFFFFF", "\r")]);
+    assert_eq!(*bench.board.filters.written.last().unwrap(), cantap_firmware::filters::Layout::open());
+}
+
+#[test]
+fn version_serial_number_and_registers_are_told() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("V", "V1001\r"), ("N", "NCDEF\r"), ("Y", "\x07"), ("S8", "\r"), ("O", "\r")]);
+    assert_eq!(say(&mut bench, "I"), format!("I{}\r", "0".repeat(56)));
+    bench.board.traffic[0].counters = (8, 0);
+    bench.board.traffic[0].error = Some(BusErrorKind::Acknowledgment);
+    bench.millisecond();
+    bench.board.traffic[0].counters = (9, 0);
+    let with_esr = |esr: u32| format!("{}{esr:08X}{}\r", "0".repeat(40), "0".repeat(8));
+    assert_eq!(say(&mut bench, "I"), format!("I{}", with_esr(9 << 16)));
+    assert_eq!(say(&mut bench, "Y"), format!("Y{}", with_esr(8 << 16)));
+}
+
+#[test]
+fn q_keeps_the_bit_rate_for_the_next_session() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[("Q1", "\x07"), ("S5", "\r"), ("O", "\r"), ("Q1", "\x07"), ("C", "\r"), ("Q1", "\r")],
+    );
+    bench.port.open = false;
+    bench.millisecond();
+    bench.port.open = true;
+    converse(&mut bench, &[("O", "\r"), ("C", "\r"), ("Q0", "\r")]);
+    let timing = bench.board.control[0].started[1].timing;
+    assert_eq!(timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ), 250_000);
+    bench.port.open = false;
+    bench.millisecond();
+    bench.port.open = true;
+    converse(&mut bench, &[("O", "\x07")]);
+}
+
+#[test]
+fn too_long_and_broken_lines_are_refused_as_lines() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), (&format!("t{}", "1".repeat(300)), "\x07"), ("V", "V1001\r")]);
+    // Terminal programs end lines with CR LF.
+    converse(&mut bench, &[("O", "\r"), ("\nF", "F00\r")]);
+}
+
+#[test]
+fn the_native_language_takes_over_from_slcan() {
+    let queue = QUEUE;
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
+    bench.greet();
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert_eq!(status.channels[0].open, None);
+}

@@ -44,13 +44,14 @@ fn each_kind_is_reported_with_the_counters() {
     assert_eq!(bench.events(), expected);
 }
 
+const PER_MS: u32 = 50;
+const MS: u32 = 1000;
+
 /// A stuck bus makes an error in each 20 µs or so: 50 000 a second.
 #[test]
 fn a_broken_bus_cannot_flood_the_link_and_every_error_is_counted() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::opened(&queue, Mode::Normal);
-    const PER_MS: u32 = 50;
-    const MS: u32 = 1000;
     for _ in 0..MS {
         for _ in 0..PER_MS {
             bench.pass(TICK_HZ / 1000 / PER_MS);

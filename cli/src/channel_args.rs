@@ -55,22 +55,31 @@ enum Recovery {
 }
 
 impl ChannelArgs {
-    /// Opens a channel, with `mode` unless the user says otherwise. Says on standard error which filters the
-    /// hardware could not take.
+    /// Opens channels, with `mode` unless the user says otherwise, and returns how. Says on standard error which
+    /// filters the hardware could not take. Whatever is impossible is found before the first is opened.
     pub fn open(
         &self,
         device: &Device,
-        channel: Channel,
+        channels: impl Iterator<Item = Channel>,
         mode: Mode,
         filters: &[Filter],
-    ) -> anyhow::Result<ChannelConfig> {
-        let config = self.config(device, channel, mode)?;
-        if !filters.is_empty()
-            && let Some(remainder) = hw_filter::apply(device, channel, filters)?.remainder
-        {
-            eprintln!("cantap: channel {}: {remainder}", channel.number());
+    ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
+        let mut opened = Vec::new();
+        for channel in channels {
+            opened.push((channel, self.config(device, channel, mode)?));
         }
-        device.open_channel(channel, Some(config)).with_context(|| format!("channel {}", channel.number()))
+        // Filters of a channel can be changed only while both are closed.
+        for (channel, _) in opened.iter().filter(|_| !filters.is_empty()) {
+            if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
+                eprintln!("cantap: channel {}: {remainder}", channel.number());
+            }
+        }
+        for (channel, config) in &opened {
+            device
+                .open_channel(*channel, Some(*config))
+                .with_context(|| format!("channel {}", channel.number()))?;
+        }
+        Ok(opened)
     }
 
     /// The configuration that was asked for; where no bit timing was, the one saved on the device.

@@ -164,3 +164,21 @@ fn a_replayed_trace_keeps_its_times_and_order() {
     assert_eq!((code, frames(&out).len()), (Some(0), 3));
     assert!(out.lines().all(|line| line.contains("can1 ")), "{out}");
 }
+
+#[test]
+fn a_capture_takes_filters_modes_and_timings() {
+    let line = "capture -d virtual:frames=mix -c 1 --segments 3,8,3,1 -n 50 -t 5s -f can0,000:C0000400";
+    let (code, out, _) = cantap(line);
+    let ids: Vec<u32> =
+        frames(&out).iter().map(|frame| u32::from_str_radix(&frame[5..8], 16).unwrap()).collect();
+    assert_eq!((code, ids.len()), (Some(0), 50));
+    assert!(ids.iter().all(|id| id & 0x400 == 0), "{out}");
+    // What the hardware cannot express is said and filtered all the same.
+    let line = "capture -d virtual:frames=std8 -c 1 -b 500k --mode normal -n 20 -t 5s -f can0,000~400";
+    let (code, out, err) = cantap(line);
+    assert!(code == Some(0) && err.contains("no inverse filters"), "{err}");
+    assert!(frames(&out).iter().all(|frame| u32::from_str_radix(&frame[5..8], 16).unwrap() & 0x400 != 0));
+    let (code, out, _) = cantap("capture -d virtual:frames=std8 -c 1 -b 500k --no-data -n 3 -t 5s");
+    assert_eq!(code, Some(0));
+    assert!(frames(&out).iter().all(|frame| frame.ends_with("#0000000000000000")), "{out}");
+}

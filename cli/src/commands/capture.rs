@@ -7,11 +7,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use cantap::device::Records;
+use cantap::filter::Filter;
 use cantap::formats::{Format, TraceWriter, WriteOptions, create_writer};
 use cantap::trigger::{Trigger, TriggerCounts};
+use cantap::wire::message::Mode;
 use cantap::{Address, Channel, Device, TraceRecord};
 
 use crate::args;
+use crate::channel_args::ChannelArgs;
 use crate::interrupt;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
@@ -19,12 +22,14 @@ use crate::trigger_args::TriggerArgs;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Channels only listen: nothing is sent and nothing acknowledged.\n\
+#[command(
+    after_help = "Channels only listen, unless --mode says otherwise: nothing is sent and nothing acknowledged.\n\
                         Without -o the trace goes to standard output, unless --json is given.\n\n\
                         Examples:\n  cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
                         cantap capture -d virtual -b 1M -n 1000\n  \
                         cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json\n  \
-                        cantap capture -d /dev/ttyACM0 -b 500k --db car.dbc --trigger 'Speed > 80' --pre 2s --post 5s -o fast.log")]
+                        cantap capture -d /dev/ttyACM0 -b 500k --db car.dbc --trigger 'Speed > 80' --pre 2s --post 5s -o fast.log"
+)]
 pub struct Args {
     /// Where the device is: a serial port, or virtual.
     #[arg(short, long)]
@@ -32,9 +37,12 @@ pub struct Args {
     /// Which channels: 1, 2 or both.
     #[arg(short, long, default_value = "both", value_parser = args::channels)]
     channel: args::Channels,
-    /// Bit rate of the bus in bit/s: 500000, 500k, 1M.
-    #[arg(short, long, value_parser = args::bitrate)]
-    bitrate: u32,
+    #[command(flatten)]
+    open: ChannelArgs,
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. In hardware as far as it can. Repeat for any of
+    /// several.
+    #[arg(short, long, value_name = "FILTER")]
+    filter: Vec<Filter>,
     /// File to write; its suffix picks the format. Without a suffix it is a candump log.
     #[arg(short, long)]
     output: Option<PathBuf>,
@@ -95,13 +103,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     let mut sink = Sink::create(args)?;
-    // Checked for all channels before any of them is opened.
-    device.timing(args.bitrate)?;
-    for channel in args.channel.iter() {
-        device.listen(channel, args.bitrate)?;
-    }
+    let opened = args.open.open(&device, args.channel.iter(), Mode::ListenOnly, &args.filter)?;
     let started = Instant::now();
-    let mut meters = [Meter::new(args.bitrate), Meter::new(args.bitrate)];
+    let bitrate = |channel| {
+        // A channel that is not open has no frames, whatever its rate.
+        let config = opened.iter().find(|(opened, _)| *opened == channel).or(opened.first());
+        config.map_or(0, |(_, config)| config.timing.bitrate_bps(device.hello().can_clock_hz))
+    };
+    let mut meters = Channel::ALL.map(|channel| Meter::new(bitrate(channel)));
     let mut records = device.records();
     let end = write_until_asked(args, &mut records, &mut sink, &mut meters, started);
     // What was captured until now is written, whatever came in between.
@@ -128,6 +137,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
+impl Args {
+    /// What the hardware could not filter is filtered here.
+    fn accepts(&self, record: &TraceRecord) -> bool {
+        self.filter.is_empty() || self.filter.iter().any(|filter| filter.accepts(record))
+    }
+}
+
 /// Why writing ended.
 enum End {
     /// By the user or the time limit: what has been captured is still wanted.
@@ -151,7 +167,7 @@ fn write_until_asked(
             return Ok(End::Asked);
         }
         let Some(batch) = records.next_batch(LOOK_EVERY)? else { return Ok(End::Enough) };
-        for record in &batch {
+        for record in batch.iter().filter(|record| args.accepts(record)) {
             meters[usize::from(record.channel == 2)].push(record);
             if !sink.write(record)? {
                 return Ok(End::NobodyReads);
@@ -176,6 +192,9 @@ fn write_until_asked(
 fn drain(args: &Args, records: &mut Records, sink: &mut Sink, meters: &mut [Meter; 2]) -> anyhow::Result<()> {
     for record in records {
         let record = record?;
+        if !args.accepts(&record) {
+            continue;
+        }
         if is_enough(args, meters) || !sink.write(&record)? {
             break;
         }

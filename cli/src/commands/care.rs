@@ -146,8 +146,8 @@ pub fn defaults(args: &Defaults) -> anyhow::Result<ExitCode> {
     let done = match &args.action {
         DefaultsAction::Save(save) => {
             let device = Device::open(&save.device)?;
-            for channel in save.channel.iter() {
-                save.open.open(&device, channel, Mode::ListenOnly, &save.filter)?;
+            let channels = save.open.open(&device, save.channel.iter(), Mode::ListenOnly, &save.filter)?;
+            for (channel, _) in channels {
                 device.close_channel(channel)?;
             }
             device.save_defaults()?;

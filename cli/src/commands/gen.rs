@@ -174,8 +174,10 @@ impl Generator<'_> {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
-    let config = args.open.open(&device, args.channel, Mode::Normal, &[])?;
-    let bitrates_bps = [config.timing.bitrate_bps(device.hello().can_clock_hz); CHANNELS];
+    let mut bitrates_bps = [0; CHANNELS];
+    for (channel, config) in args.open.open(&device, [args.channel].into_iter(), Mode::Normal, &[])? {
+        bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
+    }
     let gap = Duration::from_secs_f64(args.gap / 1e3);
     // A trace of frames that all end at once, held apart by the gap.
     let pace = Pace { shortest_gap: gap, ignore_times: gap.is_zero(), ..Pace::default() };

@@ -17,7 +17,7 @@ const QUEUE: usize = 8 * 1024 + 512;
 
 #[derive(Clone, Debug)]
 enum Action {
-    Ask(Command),
+    Ask(Box<Command>),
     /// Frames arrive, this many before the interrupt is served each time.
     Arrive {
         channel: Channel,
@@ -155,7 +155,7 @@ fn action() -> impl Strategy<Value = Action> {
         ErrorState::BusOff,
     ]);
     prop_oneof![
-        8 => command().prop_map(Action::Ask),
+        8 => command().prop_map(|command| Action::Ask(Box::new(command))),
         3 => (channel(), 1..1500_u16, 1..6_u8)
             .prop_map(|(channel, frames, at_once)| Action::Arrive { channel, frames, at_once }),
         2 => (channel(), 1..20_u8).prop_map(|(channel, frames)| Action::Take { channel, frames }),
@@ -182,7 +182,7 @@ impl Run<'_> {
             Action::Ask(command) => {
                 let id = 1000 + self.asked.len() as u16;
                 self.asked.push(id);
-                bench.say(&encode(&Request { id, command }));
+                bench.say(&encode(&Request { id, command: *command }));
             }
             Action::Arrive { channel, frames, at_once } => {
                 let index = channel.index();

@@ -88,3 +88,30 @@ fn listed(left_out: &LeftOut) -> String {
     let parts: Vec<_> = left_out.iter().map(|(what, count)| format!("{count} {what}")).collect();
     parts.join(", ")
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap::{Direction, TraceEvent};
+
+    #[test]
+    fn only_what_is_around_an_event_is_recorded_where_a_condition_is_given() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("fast.log");
+        let text = format!("{} if byte[0] > 0x80", path.display());
+        let mut recorder = Recorder::create(Path::new(&text), &Decoder::new(Vec::new())).unwrap();
+        for second in 0..30 {
+            let frame = if second == 15 { "123#FF" } else { "123#01" }.parse().unwrap();
+            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            recorder.write(&[TraceRecord { time_ns: second * 1_000_000_000, channel: 1, event }]).unwrap();
+        }
+        let state = recorder.state().unwrap();
+        assert_eq!((state.records, state.since_ns), (8, 13_000_000_000));
+        assert_eq!(recorder.finish(), format!("8 records are in {}", path.display()));
+        assert_eq!(std::fs::read_to_string(&path).unwrap().lines().count(), 8);
+        let wrong = format!("{} if byte[0] >", path.display());
+        let reason =
+            Recorder::create(Path::new(&wrong), &Decoder::new(Vec::new())).err().unwrap().to_string();
+        assert!(reason.starts_with("nothing is recorded: "), "{reason}");
+    }
+}

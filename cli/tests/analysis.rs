@@ -1,0 +1,155 @@
+//! `cantap stats`, `cantap plot` and `cantap monitor` as a user meets them.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+fn cantap() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    command.env("LC_ALL", "C.UTF-8").env("NO_COLOR", "1").stdin(std::process::Stdio::null());
+    command
+}
+
+fn boat() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/tests/data/nmea2000.log.gz")
+}
+
+/// Ten frames of 58 bits, back to back at 1 Mbit/s, as the earlier analyser's test sent them.
+fn golden_burst(folder: &Path) -> PathBuf {
+    let mut log = String::new();
+    for n in 0..10 {
+        writeln!(log, "(100.{:06}) can0 000#55", n * 58).unwrap();
+    }
+    let path = folder.join("burst.log");
+    std::fs::write(&path, log).unwrap();
+    path
+}
+
+/// Runs it and returns what it printed, on standard output and standard error, with this exit code.
+fn run(command: &mut Command, code: i32) -> (String, String) {
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    let (stdout, stderr) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
+    assert_eq!(status.code(), Some(code), "{stderr}");
+    (stdout, stderr)
+}
+
+fn stdout(command: &mut Command) -> String {
+    run(command, 0).0
+}
+
+fn failure(command: &mut Command) -> String {
+    let (stdout, stderr) = run(command, 1);
+    assert_eq!(stdout, "");
+    stderr
+}
+
+#[test]
+fn the_golden_burst_has_the_load_it_was_sent_with() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = golden_burst(folder.path());
+    let text = stdout(cantap().arg("stats").arg(&log).args(["-b", "1M", "--json"]));
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let channel = &json["channels"][0];
+    assert_eq!((&json["frames"], &channel["bits"]), (&10.into(), &580.into()));
+    assert!((channel["bus_load_pct"].as_f64().unwrap() - 100.0).abs() < 1e-6, "{channel}");
+    assert!((channel["ids"][0]["period_mean_ms"].as_f64().unwrap() - 0.058).abs() < 1e-9);
+}
+
+#[test]
+fn a_boats_bus_is_summed_up() {
+    let text = stdout(cantap().arg("stats").arg(boat()).args(["-b", "250k", "--per-id"]));
+    let lines: Vec<_> = text.lines().collect();
+    assert_eq!(lines[0], "10495 frames in 215.199309 s on 1 channel, 0 lost, 0 errors");
+    assert_eq!(lines[3], "  frames    10495 (0 standard, 10495 extended, 0 remote, 0 sent), 48.8 frames/s");
+    assert!(
+        text.contains("  09F80102      2040     23.010    105.542   2568.176     95.356  18.97%  8\n"),
+        "{text}"
+    );
+}
+
+#[test]
+fn windows_are_listed_and_add_up() {
+    let text = stdout(cantap().arg("stats").arg(boat()).args([
+        "-b",
+        "250k",
+        "--windows",
+        "--window",
+        "10s",
+        "--json",
+    ]));
+    let json: serde_json::Value = serde_json::from_str(&text).unwrap();
+    let windows = json["windows"].as_array().unwrap();
+    assert_eq!(windows.len(), 22);
+    assert_eq!(windows.iter().map(|window| window["frames"].as_u64().unwrap()).sum::<u64>(), 10_495);
+}
+
+#[test]
+fn what_cannot_be_measured_is_refused_with_the_reason() {
+    let reason = failure(cantap().arg("stats").arg(boat()).args(["-b", "10k", "--window", "1ms"]));
+    assert_eq!(
+        reason,
+        "cantap: a window must be longer than the longest frame, at 10000 bit/s 16000 µs; give a longer one\n"
+    );
+    run(cantap().arg("stats").arg(boat()).args(["-b", "fast"]), 2);
+    run(cantap().arg("stats"), 2);
+}
+
+#[test]
+fn pictures_are_written_in_the_format_of_their_suffix() {
+    let folder = tempfile::tempdir().unwrap();
+    for (suffix, start) in [("svg", &b"<svg "[..]), ("png", b"\x89PNG\r\n"), ("html", b"<!DOCTYPE html>")] {
+        let path = folder.path().join(format!("load.{suffix}"));
+        run(cantap().arg("plot").arg(boat()).args(["--bus-load", "-b", "250k", "-o"]).arg(&path), 0);
+        assert!(std::fs::read(&path).unwrap().starts_with(start), "{suffix}");
+    }
+    let reason = failure(cantap().arg("plot").arg(boat()).args(["--bus-load", "-o", "load.gif"]));
+    assert!(reason.contains("let it end in .svg, .png or .html"), "{reason}");
+    let reason = failure(cantap().arg("plot").arg(boat()));
+    assert!(reason.contains("--db FILE"), "{reason}");
+    let reason = failure(cantap().arg("plot").arg(boat()).args(["--timing", "7FF"]));
+    assert!(reason.contains("no two frames of 7FF"), "{reason}");
+}
+
+#[test]
+fn without_a_file_the_picture_is_in_the_terminal() {
+    let text = stdout(cantap().arg("plot").arg(boat()).args(["--timing", "09F80202", "--width", "60"]));
+    assert!(text.starts_with("nmea2000.log.gz: periods of 09F80202\n"), "{text}");
+    assert!(text.contains('█') && text.lines().all(|line| line.chars().count() <= 90), "{text}");
+}
+
+#[test]
+fn one_screen_can_be_printed_without_a_terminal() {
+    let text = stdout(cantap().arg("monitor").arg(boat()).args(["-b", "250k", "--once", "--view", "fixed"]));
+    assert_eq!(text.lines().count(), 24);
+    assert!(text.contains("\n1  09F80102      2040 "), "{text}");
+    let reason = failure(cantap().arg("monitor").arg(boat()));
+    assert!(reason.contains("the live view needs a terminal; use --once"), "{reason}");
+}
+
+#[test]
+fn a_broken_profile_is_told_and_the_view_opens_without_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let profile = folder.path().join("car.toml");
+    std::fs::write(&profile, "bitrates = [\"250k\"]\nspeed = 3\n").unwrap();
+    let mut command = cantap();
+    command.arg("monitor").arg(boat()).arg("-p").arg(&profile).arg("--once");
+    let (screen, said) = run(&mut command, 0);
+    assert!(said.contains("car.toml, line 2: unknown field `speed`"), "{said}");
+    assert!(screen.contains("09F80102"), "{screen}");
+}
+
+#[test]
+fn the_live_view_of_the_virtual_device_loses_nothing() {
+    let text = stdout(cantap().args([
+        "monitor",
+        "-d",
+        "virtual:load=100,frames=std0",
+        "-b",
+        "1M",
+        "--once",
+        "--view",
+        "statistics",
+    ]));
+    assert!(text.contains("Channel 1: 1000000 bit/s") && text.contains("Channel 2: 1000000 bit/s"), "{text}");
+    assert_eq!(text.matches("Lost               0 ").count(), 2, "{text}");
+}

@@ -225,7 +225,10 @@ impl ChannelStatistics {
     }
 
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
-        self.windows.advance(now_ns, closed);
+        // Only a record's own time may say that the clock was set back.
+        if now_ns > self.latest_ns {
+            self.windows.advance(now_ns, closed);
+        }
     }
 
     pub(super) fn finish(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {

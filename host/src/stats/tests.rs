@@ -109,6 +109,19 @@ fn an_interruption_counts_for_neither_load_nor_period() {
     assert_eq!(channel.lost.total, 0);
 }
 
+#[test]
+fn time_that_comes_late_without_a_record_changes_nothing() {
+    let mut statistics = at_1_mbit();
+    let mut windows = 0;
+    for second in 0..5 {
+        statistics.push_with(&frame(second * 1_000_000, 1, "000#55"), |_| windows += 1);
+        statistics.advance_with(second * 1_000_000_000 - 3_000_000_000, |_| windows += 1);
+    }
+    assert_eq!(windows, 4);
+    statistics.advance_with(9_500_000_000, |_| windows += 1);
+    assert_eq!(windows, 8);
+}
+
 /// Files may say anything.
 #[test]
 fn no_time_however_wild_makes_it_panic() {

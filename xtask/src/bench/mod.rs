@@ -10,6 +10,8 @@ mod host;
 #[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
+mod stats;
+#[cfg(feature = "bench")]
 mod wire;
 
 use anyhow::Result;
@@ -27,6 +29,8 @@ enum Subject {
     Emulated,
     /// Frames per second that the host decodes, tightens and places in time.
     Host,
+    /// Frames per second whose load, periods and losses are measured.
+    Stats,
 }
 
 /// What `cargo xtask bench` takes.
@@ -62,6 +66,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
             Subject::Host => host::run()?,
+            Subject::Stats => stats::run()?,
         }
     }
     Ok(())

@@ -69,8 +69,10 @@ impl Disruption {
     }
 }
 
-fn board() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+/// A board on a host that resets a new device twice, or once.
+fn board(second_reset: bool) -> Option<Rig> {
+    let timing = Timing { second_reset, ..Timing::hasty() };
+    let mut rig = Rig::new(common::firmware()?, Setup::default(), timing);
     rig.plug_in().unwrap();
     let from = rig.now();
     for channel in Channel::ALL {
@@ -91,8 +93,8 @@ fn begin(rig: &mut Rig) {
 fn the_device_survives_a_host_that_goes_away_at_any_instant() {
     let mut random = fastrand::Rng::with_seed(20_261);
     let mut captured = 0;
-    for _ in 0..INSTANTS / INSTANTS_PER_BOARD {
-        let Some(mut rig) = board() else { return };
+    for number in 0..INSTANTS / INSTANTS_PER_BOARD {
+        let Some(mut rig) = board(number % 2 == 0) else { return };
         for _ in 0..INSTANTS_PER_BOARD {
             let disruption = DISRUPTIONS[random.usize(..DISRUPTIONS.len())];
             begin(&mut rig);
@@ -161,7 +163,7 @@ fn an_enumeration_may_be_cut_off_anywhere() {
 /// Handshakes get lost on real cables: the device sends the packet again, and the host drops the copy.
 #[test]
 fn a_lost_handshake_neither_loses_nor_doubles_a_frame() {
-    let Some(mut rig) = board() else { return };
+    let Some(mut rig) = board(true) else { return };
     rig.with_host(|host, _| host.drop_handshake_every(Some(7)));
     begin(&mut rig);
     rig.run_for(100 * MS).unwrap();
@@ -178,7 +180,7 @@ fn a_lost_handshake_neither_loses_nor_doubles_a_frame() {
 /// begins without an enumeration.
 #[test]
 fn resume_needs_no_enumeration() {
-    let Some(mut rig) = board() else { return };
+    let Some(mut rig) = board(true) else { return };
     begin(&mut rig);
     rig.run_for(5 * MS).unwrap();
     rig.with_host(|host, _| host.suspend());

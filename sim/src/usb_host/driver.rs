@@ -108,6 +108,7 @@ pub(super) struct Driver {
     last_address: u8,
     ep0_packet: usize,
     resets: u32,
+    second_wanted: bool,
     pending: Option<Pending>,
     device: Option<Device>,
     configuration_length: u16,
@@ -148,6 +149,7 @@ impl Driver {
             last_address: 0,
             ep0_packet: 64,
             resets: 0,
+            second_wanted: true,
             pending: None,
             device: None,
             configuration_length: 0,
@@ -237,8 +239,9 @@ impl Driver {
     }
 
     /// The port's reset is over: the first look, or what follows the second.
-    pub(super) fn after_reset(&mut self) {
+    pub(super) fn after_reset(&mut self, second_wanted: bool) {
         self.resets += 1;
+        self.second_wanted = second_wanted;
         self.address = 0;
         self.begin(if self.resets == 1 { Purpose::FirstLook } else { Purpose::Address });
     }
@@ -469,7 +472,11 @@ impl Driver {
                     return short("fewer than 8 bytes of the device descriptor");
                 };
                 self.ep0_packet = usize::from(packet);
-                self.reset_request = true;
+                if self.second_wanted {
+                    self.reset_request = true;
+                } else {
+                    self.begin(Purpose::Address);
+                }
             }
             Purpose::Address => {
                 self.address = self.last_address;

@@ -64,6 +64,9 @@ pub struct Timing {
     pub retry: u64,
     /// How long a control transfer may be answered with NAK (USB 2.0, 9.2.6.1 allows 5 s).
     pub control_timeout: u64,
+    /// Reset a second time after the first look at the device, as Linux does. Hosts that do not leave a device with
+    /// one chance to get its endpoints right.
+    pub second_reset: bool,
     /// Data packets in one frame at most, over all pipes: up to 19 of 64 bytes.
     pub packets_per_frame: u32,
     /// Bytes that a read of the bulk IN pipe asks for: it completes when they are there or with a
@@ -80,6 +83,7 @@ impl Default for Timing {
             resume: 20 * FRAME,
             retry: 10 * CYCLES_PER_US,
             control_timeout: 1000 * FRAME,
+            second_reset: true,
             packets_per_frame: 19,
             read_bytes: 128,
         }
@@ -389,7 +393,7 @@ impl UsbHost {
             Bus::Debounce { .. } => self.begin_reset(otg),
             Bus::Reset { .. } => {
                 otg.enumeration_done();
-                self.driver.after_reset();
+                self.driver.after_reset(self.timing.second_reset);
                 self.run(self.timing.recovery);
             }
             Bus::Resuming { .. } => self.run(self.timing.recovery),

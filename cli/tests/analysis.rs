@@ -127,6 +127,14 @@ fn one_screen_can_be_printed_without_a_terminal() {
 }
 
 #[test]
+fn without_anything_the_virtual_device_is_shown() {
+    let text = stdout(cantap().args(["monitor", "--once", "-t", "600ms", "--view", "trace"]));
+    assert!(text.contains(" virtual listen-only: running"), "{text}");
+    let reason = failure(cantap().args(["monitor", "-d", "/dev/nowhere", "--once"]));
+    assert!(reason.contains("give a bit rate, such as 500k"), "{reason}");
+}
+
+#[test]
 fn a_broken_profile_is_told_and_the_view_opens_without_it() {
     let folder = tempfile::tempdir().unwrap();
     let profile = folder.path().join("car.toml");

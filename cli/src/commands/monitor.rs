@@ -28,7 +28,7 @@ use crate::monitor::{once, orders, run as show};
     cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
     cantap monitor trace.blf -b 500k --db car.dbc\n  \
     cantap monitor -p car.toml\n\n\
-h shows the keys. Without a device and a file, the virtual device is shown.")]
+h shows the keys. Without a device and a file, the virtual device is shown, at 500 kbit/s without -b.")]
 pub struct Args {
     /// A trace to play back instead of a device.
     #[arg(value_name = "FILE", conflicts_with = "device")]
@@ -93,7 +93,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut complaints = Vec::new();
     let profile = load_profile(args.profile.as_deref(), &mut complaints);
     let decoder = load_databases(args, &profile, &mut complaints);
-    let rates = bit_rates(args, &profile, &mut complaints);
+    let mut rates = bit_rates(args, &profile, &mut complaints);
+    if rates.is_empty() && args.file.is_none() && is_virtual(args, &profile) {
+        // Its buses take the bit rate of whoever opens them.
+        rates.push(ChannelBitrate { channel: None, bitrate_bps: 500_000 });
+    }
     let options = ChannelBitrate::options(&rates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
     model.filters.clone_from(&args.filter);
@@ -131,6 +135,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         show(origin, app, model, receiver)?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Whether the device is, or by default will be, the virtual one.
+fn is_virtual(args: &Args, profile: &Profile) -> bool {
+    match (&args.device, &profile.device) {
+        (Some(address), _) => matches!(address, Address::Virtual(_)),
+        (None, Some(text)) => matches!(text.parse(), Ok(Address::Virtual(_))),
+        (None, None) => true,
+    }
 }
 
 fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {

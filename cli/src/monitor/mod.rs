@@ -5,6 +5,7 @@ pub mod app;
 pub mod model;
 pub mod profile;
 mod recorder;
+pub mod sending;
 pub mod source;
 #[cfg(test)]
 mod tests;

@@ -83,6 +83,8 @@ pub struct Rig {
     usb: Arc<Mutex<UsbPort>>,
     /// Channels whose frames are in the books.
     booked: [bool; CHANNELS],
+    /// From a cut to the next greeting: records are remains of the session before.
+    between_sessions: bool,
     events: Vec<(u64, Event)>,
     last_bytes_at: u64,
     /// Bits of frames on each bus, with intermission, as long as it was booked.
@@ -102,6 +104,7 @@ impl Rig {
             ledger: Ledger::new(),
             usb,
             booked: [false; CHANNELS],
+            between_sessions: false,
             events: Vec::new(),
             last_bytes_at: 0,
             bus_bits: [0; CHANNELS],
@@ -183,8 +186,11 @@ impl Rig {
         if let Some(recording) = &mut self.recording {
             recording.extend_from_slice(&bytes);
         }
-        let Self { session, ledger, events, .. } = self;
+        let Self { session, ledger, events, between_sessions, .. } = self;
         session.take(&bytes, |heard| {
+            if *between_sessions {
+                return;
+            }
             if let Heard::Record(ticks, Record::Event(event)) = &heard {
                 events.push((*ticks, *event));
             }
@@ -228,6 +234,7 @@ impl Rig {
         let Reply::Hello(hello) = reply else {
             return Err(wrong("Hello", &reply));
         };
+        self.between_sessions = false;
         self.follow_clock(hello.tick_hz);
         Ok(hello)
     }
@@ -300,9 +307,12 @@ impl Rig {
         Ok(())
     }
 
-    /// The session was cut (unplugged, reset, suspended): what has not arrived will not.
+    /// The session was cut (unplugged, reset, suspended): what has not arrived will not. What waits in
+    /// the device's endpoint or the host's driver may still come when the port is opened again; like every host, this one
+    /// ignores it until it has greeted the device again.
     pub fn cut(&mut self) {
         self.exchange();
+        self.between_sessions = true;
         for channel in Channel::ALL {
             self.booked[channel.index()] = false;
             self.ledger.close(channel, false);

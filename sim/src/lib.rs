@@ -10,6 +10,7 @@ pub mod bus;
 pub mod can;
 pub mod capture;
 pub mod cpu;
+pub mod drive;
 pub mod elf;
 pub mod link;
 pub mod machine;

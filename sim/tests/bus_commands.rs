@@ -1,0 +1,175 @@
+//! What the firmware's ELF does on request: filters, bit rates, replies, periods, times, load, slcan.
+
+mod common;
+
+use cantap_sim::bus::{BitTime, Node};
+use cantap_sim::drive::{self, join};
+use cantap_sim::machine::Setup;
+use cantap_sim::rig::{MS, Rig, timing};
+use cantap_sim::traffic::{Kind, Script, Traffic};
+use cantap_sim::usb_host::Timing;
+use cantap_wire::message::{ChannelConfig, Filter, FrameKind};
+use cantap_wire::{Channel, Command, Frame};
+
+const MEGABIT: u32 = 1_000_000;
+use Channel::{Can1, Can2};
+
+fn connected() -> Option<Rig> {
+    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    rig.connect().unwrap();
+    Some(rig)
+}
+
+/// Three seconds of emulation would be no better: 100 replies at different phases of the other channel's traffic.
+#[test]
+fn a_reply_starts_within_50_us_even_with_the_other_channel_full() {
+    let Some(mut rig) = connected() else { return };
+    join(&mut rig).unwrap();
+    rig.listen(Can2, MEGABIT).unwrap();
+    let from = rig.now();
+    rig.add_traffic(Can2, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + 90 * MS));
+    let latency = drive::reply_latency(&mut rig).unwrap().expect("every call has its reply");
+    eprintln!("reply latency {latency:?}");
+    assert!(latency.min_us >= 3.0 && latency.max_us <= 50.0, "{latency:?}");
+}
+
+#[test]
+fn periodic_frames_keep_their_period() {
+    let Some(mut rig) = connected() else { return };
+    join(&mut rig).unwrap();
+    let jitter = drive::periodic_jitter(&mut rig, 1000).unwrap().expect("all were sent");
+    eprintln!("periodic jitter {jitter:?}");
+    assert!(jitter.min_us >= -2.0 && jitter.max_us <= 2.0, "{jitter:?}");
+}
+
+#[test]
+fn timed_frames_keep_their_spacing_within_2_us_below_saturation() {
+    let Some(mut rig) = connected() else { return };
+    join(&mut rig).unwrap();
+    for load in [30.0, 90.0] {
+        let late = drive::timed_start(&mut rig, load).unwrap().expect("all were sent, in order");
+        eprintln!("timed start at {load} % {late:?}");
+        assert!(late.width_us() <= 2.0, "at {load} %: {late:?}");
+    }
+}
+
+#[test]
+fn queued_frames_fill_the_bus() {
+    let Some(mut rig) = connected() else { return };
+    join(&mut rig).unwrap();
+    let load = drive::back_to_back_load(&mut rig).unwrap();
+    eprintln!("back to back {load} %");
+    assert!(load >= 99.0, "{load} %");
+}
+
+#[test]
+fn hardware_filters_accept_and_reject() {
+    let Some(mut rig) = connected() else { return };
+    let filter = |extended, kind, id, mask| Filter { extended, kind, id, mask };
+    let filters = [
+        filter(false, FrameKind::Data, 0x123, 0x7FF),
+        filter(false, FrameKind::Any, 0x400, 0x700),
+        filter(true, FrameKind::Remote, 0x1234_5678, 0x1FFF_FFFF),
+        filter(true, FrameKind::Any, 0x1000_0000, 0x1F00_0000),
+    ];
+    let texts = [
+        "123#",
+        "123#R",
+        "124#",
+        "400#R",
+        "4FF#00",
+        "500#",
+        "00000123#",
+        "12345678#R1",
+        "12345678#",
+        "10ABCDEF#",
+        "11000000#",
+        "00000400#",
+    ];
+    let wanted: Vec<Frame> = texts.iter().map(|text| text.parse().unwrap()).collect();
+    let wanted = wanted.iter().filter(|frame| filters.iter().any(|filter| filter.matches(frame))).count();
+    assert_eq!(wanted, 5);
+    for channel in [Can1, Can2] {
+        rig.ask(Command::SetFilters { channel, filters: filters.into_iter().collect() }).unwrap();
+        // Not through the books: they expect every frame of the bus.
+        let config = ChannelConfig::listen_only(timing(MEGABIT).unwrap());
+        rig.ask(Command::Open { channel, config: Some(config) }).unwrap();
+        let from = rig.now() + MS;
+        let frames =
+            texts.iter().zip(0..).map(|(text, n)| (from + n * MS / 4, text.parse().unwrap())).collect();
+        let mut board = rig.machine.board();
+        let wire = &mut board.wires[channel.index()];
+        wire.add(Node::new(BitTime::of_rate(MEGABIT)));
+        wire.add(Node::new(BitTime::of_rate(MEGABIT)).with_source(Script::new(frames)));
+        drop(board);
+        rig.run_for(6 * MS).unwrap();
+        let status = rig.status().unwrap().channels[channel.index()];
+        assert_eq!((status.frames as usize, status.bus_errors), (wanted, 0), "{channel:?}");
+        rig.ask(Command::Close { channel }).unwrap();
+    }
+}
+
+#[test]
+fn every_cia_rate_is_heard_and_its_double_is_not() {
+    let Some(mut rig) = connected() else { return };
+    let mut added = false;
+    for rate in [1_000_000, 800_000, 500_000, 250_000, 125_000, 100_000, 50_000, 20_000] {
+        let from = rig.now() + MS;
+        let ms = 12_000_000 / u64::from(rate) + 4;
+        let traffic = Traffic::new(Kind::Mix, u64::from(rate), 80.0, from, from + 3 * ms * MS);
+        if added {
+            rig.change_traffic(Can1, BitTime::of_rate(rate), Some(Box::new(traffic)));
+        } else {
+            rig.add_traffic(Can1, rate, traffic);
+            added = true;
+        }
+        let mut before = rig.status().unwrap().channels[0];
+        for (listen_at, heard) in [(rate, true), (if rate == 1_000_000 { 500_000 } else { 2 * rate }, false)]
+        {
+            if timing(listen_at).is_err() || listen_at > 1_000_000 {
+                continue;
+            }
+            let config = ChannelConfig::listen_only(timing(listen_at).unwrap());
+            rig.ask(Command::Open { channel: Can1, config: Some(config) }).unwrap();
+            rig.run_for(ms * MS).unwrap();
+            rig.ask(Command::Close { channel: Can1 }).unwrap();
+            let now = rig.status().unwrap().channels[0];
+            let (frames, errors) = (now.frames - before.frames, now.bus_errors - before.bus_errors);
+            assert_eq!(
+                (frames > 3, errors == 0),
+                (heard, heard),
+                "{rate} heard at {listen_at}: {frames}, {errors}"
+            );
+            before = now;
+        }
+        assert_eq!(rig.dominant_bits(Can1), 0, "a listener that drives the bus");
+    }
+}
+
+#[test]
+fn slcan_talks_over_the_same_port() {
+    let Some(image) = common::firmware() else { return };
+    let mut rig = Rig::new(image, Setup::default(), Timing::hasty());
+    rig.plug_in().unwrap();
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(500_000)));
+    for (line, answer) in [
+        ("\r\r", "\r\r"),
+        ("V\r", "V1001\r"),
+        ("C\r", "\r"),
+        ("S6\r", "\r"),
+        ("t1230\r", "\x07"),
+        ("O\r", "\r"),
+        ("t1232DEAD\r", "z\r"),
+        ("T1ABBCCDD3112233\r", "Z\r"),
+        ("F\r", "F00\r"),
+    ] {
+        rig.with_host(|host, _| host.send(line.as_bytes()));
+        let heard = rig.run_unbooked(4 * MS).unwrap();
+        assert_eq!(String::from_utf8_lossy(&heard), answer, "the answer to {line:?}");
+    }
+    let from = rig.now() + MS;
+    let sender = Script::new(vec![(from, "7FF#0102".parse().unwrap())]);
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(500_000)).with_source(sender));
+    let heard = rig.run_unbooked(4 * MS).unwrap();
+    assert_eq!(String::from_utf8_lossy(&heard), "t7FF20102\r");
+}

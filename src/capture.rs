@@ -117,16 +117,27 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// The transmit interrupt: a mailbox has finished.
-    pub fn on_transmit(
+    pub fn on_transmit<C: Clock>(
         &mut self,
         channel: Channel,
         traffic: &mut impl Traffic,
-        clock: &impl Clock,
+        clock: &C,
         entered: u32,
     ) {
         let now = self.recorder.time(entered);
         let state = &mut self.channels[channel.index()];
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
+        // On a busy bus the next frame is due at once: leaving for the alarm would cost more time than there is.
+        let now = self.recorder.time(clock.now());
+        if let Some(due) = state.transmitter.next_due()
+            && due <= now + u64::from(C::ALARM_EARLY_TICKS)
+        {
+            if due > now {
+                clock.wait_until(due as u32);
+            }
+            let now = self.recorder.time(clock.now());
+            state.transmitter.service(traffic, &mut self.recorder, now);
+        }
         self.arm(clock);
     }
 
@@ -139,8 +150,15 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// The alarm: something is due for transmission.
-    pub fn on_alarm<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
-        let now = self.recorder.time(clock.now());
+    pub fn on_alarm<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
+        let mut now = self.recorder.time(clock.now());
+        if let Some(due) = self.next_due()
+            && due.saturating_sub(now) <= u64::from(C::ALARM_EARLY_TICKS)
+            && due > now
+        {
+            clock.wait_until(due as u32);
+            now = self.recorder.time(clock.now());
+        }
         for (state, traffic) in self.channels.iter_mut().zip(traffic) {
             if state.open.is_some() {
                 state.transmitter.service(traffic, &mut self.recorder, now);
@@ -183,12 +201,21 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
+    /// When something is due for transmission next.
+    fn next_due(&self) -> Option<u64> {
+        let open = self.channels.iter().filter(|state| state.open.is_some());
+        open.filter_map(|state| state.transmitter.next_due()).min()
+    }
+
     /// Sets the alarm for what is due next.
-    pub fn arm(&mut self, clock: &impl Clock) {
-        let due = self.channels.iter().filter(|state| state.open.is_some());
-        let due = due.filter_map(|state| state.transmitter.next_due()).min();
+    pub fn arm<C: Clock>(&mut self, clock: &C) {
         let now = self.recorder.time(clock.now());
-        clock.set_alarm(due.map(|due| due.min(now + ALARM_AHEAD_TICKS) as u32));
+        let alarm = self.next_due().map(|due| {
+            let early = due.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
+            // Not earlier than now: a time that has passed for long would look like one that is far ahead.
+            early.clamp(now, now + ALARM_AHEAD_TICKS) as u32
+        });
+        clock.set_alarm(alarm);
     }
 
     /// The 64-bit time now.

@@ -18,6 +18,11 @@ pub trait Clock {
     /// Calls the alarm interrupt at this time; at once if it has passed (by less than half the
     /// timer's range); never if `None`.
     fn set_alarm(&self, at: Option<u32>);
+    /// Ticks by which the alarm is set before its time, so that an interrupt that is under way then has ended when
+    /// the time comes; the rest is left to [`Self::wait_until`]. None where no interrupt is ever late.
+    const ALARM_EARLY_TICKS: u32 = 0;
+    /// Waits for a time that is at most [`Self::ALARM_EARLY_TICKS`] ahead.
+    fn wait_until(&self, _at: u32) {}
 }
 
 /// How a transmission ended.

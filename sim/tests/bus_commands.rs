@@ -37,6 +37,9 @@ fn a_reply_starts_within_50_us_even_with_the_other_channel_full() {
 fn periodic_frames_keep_their_period() {
     let Some(mut rig) = connected() else { return };
     join(&mut rig).unwrap();
+    rig.listen(Can2, MEGABIT).unwrap();
+    let from = rig.now();
+    rig.add_traffic(Can2, MEGABIT, Traffic::new(Kind::Mix, 1, 100.0, from, from + 110 * MS));
     let jitter = drive::periodic_jitter(&mut rig, 1000).unwrap().expect("all were sent");
     eprintln!("periodic jitter {jitter:?}");
     assert!(jitter.min_us >= -2.0 && jitter.max_us <= 2.0, "{jitter:?}");

@@ -2,8 +2,8 @@
 
 use core::ops::Deref;
 
-use cantap_firmware::TICK_HZ;
 use cantap_firmware::ports::Clock;
+use cantap_firmware::{TICK_HZ, TICKS_PER_US};
 use stm32f4xx_hal::pac::TIM2;
 use stm32f4xx_hal::pac::tim2::RegisterBlock;
 use stm32f4xx_hal::rcc::{BusTimerClock, Enable, Rcc, Reset};
@@ -52,6 +52,16 @@ impl StampTimer {
 }
 
 impl Clock for StampTimer {
+    /// 6 µs: longer than the other handlers of the alarm's priority take for a frame, and the USB driver masks
+    /// interrupts. Stamps are taken at a higher priority and do not wait; draining the FIFOs has 144 µs.
+    const ALARM_EARLY_TICKS: u32 = 6 * TICKS_PER_US;
+
+    #[inline]
+    fn wait_until(&self, at: u32) {
+        // Bounded: whoever calls this has found that the time is at most ALARM_EARLY_TICKS ahead.
+        while (at.wrapping_sub(self.now()) as i32) > 0 {}
+    }
+
     #[inline]
     fn now(&self) -> u32 {
         self.cnt().read().bits()

@@ -4,6 +4,8 @@
 //! need. One file per subject; each has `run()`, which prints its own table.
 
 #[cfg(feature = "bench")]
+mod bus;
+#[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
 mod host;
@@ -27,6 +29,8 @@ enum Subject {
     Signals,
     /// What the firmware's ELF costs and bears on the emulated board.
     Emulated,
+    /// Replies, periods, replay and load on the emulated bus.
+    Bus,
     /// Frames per second that the host decodes, tightens and places in time.
     Host,
     /// Frames per second whose load, periods and losses are measured.
@@ -65,6 +69,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Wire => wire::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
+            Subject::Bus => bus::run()?,
             Subject::Host => host::run()?,
             Subject::Stats => stats::run()?,
         }

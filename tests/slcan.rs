@@ -11,7 +11,6 @@ use cantap_wire::{BitTiming, Channel, Command, Frame, Reply};
 use fakes::{Bench, SMALL_QUEUE};
 
 const CAN1: Channel = Channel::Can1;
-const QUEUE: RecordQueue<SMALL_QUEUE> = RecordQueue::new();
 
 /// What the device answers to a line, frames of the bus included.
 fn say<const N: usize>(bench: &mut Bench<'_, N>, line: &str) -> String {
@@ -40,7 +39,7 @@ fn receive<const N: usize>(bench: &mut Bench<'_, N>, frame: &str) -> String {
 
 #[test]
 fn a_channel_is_set_up_opened_and_closed() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -73,7 +72,7 @@ fn a_channel_is_set_up_opened_and_closed() {
 
 #[test]
 fn each_s_digit_is_its_bit_rate() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     for (digit, rate) in [10, 20, 50, 100, 125, 250, 500, 800, 1000].iter().enumerate() {
         converse(&mut bench, &[(&format!("S{digit}"), "\r"), ("O", "\r"), ("C", "\r")]);
@@ -85,7 +84,7 @@ fn each_s_digit_is_its_bit_rate() {
 /// `s` takes an SJA1000's BTR0 and BTR1 at 16 MHz: 001C is 500 kbit/s with its sample point at 87.5 %.
 #[test]
 fn raw_registers_of_an_sja1000_give_its_rate_and_triple_sampling_is_refused() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -98,7 +97,7 @@ fn raw_registers_of_an_sja1000_give_its_rate_and_triple_sampling_is_refused() {
 
 #[test]
 fn frames_are_sent_and_their_order_kept() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -124,7 +123,7 @@ fn frames_are_sent_and_their_order_kept() {
 
 #[test]
 fn a_full_transmit_queue_is_refused_and_flagged() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     let taken = (0..400).take_while(|_| say(&mut bench, "t1230") == "z\r").count();
@@ -134,7 +133,7 @@ fn a_full_transmit_queue_is_refused_and_flagged() {
 
 #[test]
 fn received_frames_are_lines_with_the_stamps_that_were_asked_for() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     assert_eq!(receive(&mut bench, "123#DEADBEEF"), "t1234DEADBEEF\r");
@@ -157,7 +156,7 @@ fn received_frames_are_lines_with_the_stamps_that_were_asked_for() {
 
 #[test]
 fn frames_are_polled_where_asked() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -171,7 +170,7 @@ fn frames_are_polled_where_asked() {
 
 #[test]
 fn losses_and_errors_set_flags_that_reading_clears() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     // Four frames for a FIFO of three.
@@ -203,7 +202,7 @@ fn losses_and_errors_set_flags_that_reading_clears() {
 /// M and m are an SJA1000's acceptance code and mask; a mask bit of 1 does not count. With W1, one long filter.
 #[test]
 fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -219,7 +218,7 @@ fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
 
 #[test]
 fn version_serial_number_and_registers_are_told() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("V", "V1001\r"), ("N", "NCDEF\r"), ("Y", "\x07"), ("S8", "\r"), ("O", "\r")]);
     assert_eq!(say(&mut bench, "I"), format!("I{}\r", "0".repeat(56)));
@@ -234,7 +233,7 @@ fn version_serial_number_and_registers_are_told() {
 
 #[test]
 fn q_keeps_the_bit_rate_for_the_next_session() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(
         &mut bench,
@@ -254,7 +253,7 @@ fn q_keeps_the_bit_rate_for_the_next_session() {
 
 #[test]
 fn too_long_and_broken_lines_are_refused_as_lines() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), (&format!("t{}", "1".repeat(300)), "\x07"), ("V", "V1001\r")]);
     // Terminal programs end lines with CR LF.
@@ -263,7 +262,7 @@ fn too_long_and_broken_lines_are_refused_as_lines() {
 
 #[test]
 fn the_native_language_takes_over_from_slcan() {
-    let queue = QUEUE;
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     bench.greet();

@@ -88,8 +88,8 @@ pub fn reply_latency(rig: &mut Rig) -> Result<Option<Range>, RigError> {
 pub fn periodic_jitter(rig: &mut Rig, period_us: u64) -> Result<Option<Range>, RigError> {
     const COUNT: u64 = 100;
     let period_ticks = (period_us * TICKS_PER_US) as u32;
-    let entry =
-        Periodic { frame: frame(0x300), period_ticks, count: COUNT as u32, modifiers: Default::default() };
+    let modifiers = [].into_iter().collect();
+    let entry = Periodic { frame: frame(0x300), period_ticks, count: COUNT as u32, modifiers };
     rig.ask(Command::SetPeriodic { channel: CHANNEL, slot: 0, entry: Some(entry) })?;
     let crossed = watch(rig, (COUNT + 2) * period_us * CYCLES_PER_US)?;
     let starts: Vec<u64> = ours(&crossed).map(|frame| frame.start).collect();

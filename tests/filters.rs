@@ -5,7 +5,7 @@ use cantap_wire::message::{Filter, FrameKind};
 use cantap_wire::{Channel, Frame, Id, Refusal};
 use proptest::prelude::*;
 
-/// A frame as bxCAN compares it (RM0090 Rev 21 §32.7.4, figure 343): STID EXID IDE RTR in 32 bits, STID RTR IDE EXID[17:15] in 16.
+/// A frame as bxCAN compares it (RM0090, "Filter bank scale and mode configuration"): STID EXID IDE RTR in 32 bits, STID RTR IDE EXID[17:15] in 16.
 fn registers(frame: &Frame) -> (u32, u16) {
     let (id, remote) = (frame.id(), u32::from(frame.is_remote()));
     let (stid, exid) = if id.is_extended() { (id.raw() >> 18, id.raw() & 0x3_FFFF) } else { (id.raw(), 0) };

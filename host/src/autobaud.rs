@@ -26,7 +26,7 @@ const GOOD_FRAMES: u32 = 4;
 const ASK_EVERY: Duration = Duration::from_millis(2);
 /// The scan's step: near enough that one of two neighbours is heard.
 const SCAN_STEP: f64 = 1.007;
-/// Rates nearer than this cannot be told apart by listening, and need not be (ISO 11898-1 allows each node's clock 0.5 %).
+/// Rates nearer than this cannot be told apart by listening, and need not be.
 const SAME: f64 = 0.005;
 /// Distance of the neighbours that are compared: with 253.97 kbit/s for 250, the wrong one's are at 0 and 3.2 %.
 const NEIGHBOUR: f64 = 0.016;

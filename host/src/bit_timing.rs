@@ -6,11 +6,11 @@
 //! bus. All figures here take phase segment 1 as long as the jump width, the least that resynchronisation
 //! needs, and leave the rest to propagation:
 //!
-//! - *Oscillator tolerance* (Bosch, "CAN Specification 2.0", part B, §10; "The Configuration of the CAN Bit Timing",
+//! - *Oscillator tolerance* ("The Configuration of the CAN Bit Timing",
 //!   Hartwich and Bassemir, 1999): the smaller of `min(PS1, PS2) / (2 · (13 · tbit − PS2))` and `SJW / (20 · tbit)`.
 //! - *Cable length*: a bit goes to the far end and the answer comes back within the propagation segment, so
 //!   `length = (PROP / 2 − 150 ns) / 5 ns/m`: 150 ns for a controller, a transceiver and back; 5 ns/m for the
-//!   line. This gives 28 m at 1 Mbit/s and 520 m at 125 kbit/s, where CiA 102 recommends 25 m and 500 m.
+//!   line. This gives 28 m at 1 Mbit/s and 520 m at 125 kbit/s; 25 m and 500 m are the usual rule.
 
 use std::fmt;
 
@@ -139,7 +139,7 @@ pub fn parse_segments(text: &str) -> Result<BitTiming, TimingError> {
     if timing.is_valid() { Ok(timing) } else { Err(TimingError::Segments(timing)) }
 }
 
-/// Reads the value of bxCAN's bit timing register (RM0090 Rev 21 §32.9.2, CAN_BTR).
+/// Reads the value of bxCAN's bit timing register (RM0090, "CAN bit timing register").
 pub fn from_register(btr: u32) -> Result<BitTiming, TimingError> {
     const TIMING_BITS: u32 = 0x037F_03FF;
     if btr & !TIMING_BITS != 0 {
@@ -279,13 +279,13 @@ mod tests {
     }
 
     #[test]
-    fn cables_are_about_as_long_as_cia_recommends() {
-        for (bitrate_bps, cia_m) in
+    fn cables_are_about_as_long_as_the_usual_rule_has_it() {
+        for (bitrate_bps, rule_m) in
             [(1_000_000, 25.0), (800_000, 50.0), (500_000, 100.0), (250_000, 250.0), (125_000, 500.0)]
         {
             let timing = rate(bitrate_bps, None, None).resolve(CLOCK).unwrap();
             let cable_m = Assessment::of(&timing, CLOCK).cable_m;
-            assert!((cable_m / cia_m - 1.0).abs() < 0.25, "{bitrate_bps}: {cable_m} m");
+            assert!((cable_m / rule_m - 1.0).abs() < 0.25, "{bitrate_bps}: {cable_m} m");
         }
     }
 

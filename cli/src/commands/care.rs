@@ -82,9 +82,9 @@ struct Clear {
     device: Address,
 }
 
-/// Where an STM32's flash begins (RM0090 Rev 21 §3.3, memory map).
+/// Where an STM32's flash begins.
 const FLASH_START: u32 = 0x0800_0000;
-/// The ROM bootloader's USB IDs (AN2606).
+/// The ROM bootloader's USB IDs.
 const DFU_ID: &str = "0483:df11";
 /// An image cannot be longer than the largest flash of the family, 1 MiB.
 const MAX_IMAGE: u64 = 1 << 20;
@@ -125,7 +125,7 @@ pub fn update(args: &Update) -> anyhow::Result<ExitCode> {
 }
 
 /// Refuses what is no image for this chip, before the device leaves its firmware: an image begins with the stack's
-/// end, in RAM, and the reset vector, an odd address in flash (ARMv7-M ARM, B1.5.3).
+/// end, in RAM, and the reset vector, an odd address in flash.
 fn check_image(image: &[u8]) -> anyhow::Result<()> {
     let word =
         |at: usize| image.get(at..at + 4).and_then(|bytes| bytes.try_into().ok()).map(u32::from_le_bytes);

@@ -1,0 +1,97 @@
+//! Every format gives back what was written, plain and compressed, and says what it could not carry.
+
+#![cfg(feature = "formats")]
+
+#[path = "../src/testing.rs"]
+mod testing;
+mod traces;
+
+use cantap::formats::{CsvDialect, Format, TrcVersion};
+// `testing` takes them from here.
+use cantap::{Direction, TraceEvent, TraceRecord};
+use proptest::prelude::*;
+use traces::{directory, file_name, read, real, write};
+
+/// The finest step of a format's times.
+fn resolution_ns(format: Format) -> i64 {
+    match format {
+        Format::Trc(TrcVersion::V1_0) => 1_000_000,
+        Format::Trc(TrcVersion::V1_1) => 100_000,
+        Format::Candump | Format::Asc | Format::Trc(_) => 1000,
+        Format::Blf | Format::Csv(_) | Format::Pcapng | Format::Dif => 1,
+    }
+}
+
+#[test]
+fn real_traffic_survives_every_format_plain_and_compressed() {
+    let directory = directory("real_traffic");
+    let written = real(usize::MAX);
+    assert_eq!(written.len(), 10_495, "frames in the real file");
+    for format in Format::all() {
+        for compression in ["", ".gz", ".zst"] {
+            let path = directory.join(file_name(format, compression));
+            let left_out = write(&path, format, &written);
+            let (records, issues) = read(&path);
+            assert_eq!(issues, Vec::<String>::new(), "{}", path.display());
+            assert_eq!(records.len(), written.len(), "{}", path.display());
+            for (record, original) in records.iter().zip(&written) {
+                let off_ns = original.time_ns - record.time_ns;
+                assert!(off_ns.abs() < resolution_ns(format), "{}: {off_ns} ns", path.display());
+                let expected = TraceRecord { time_ns: record.time_ns, ..*original };
+                assert_eq!(*record, expected, "{}", path.display());
+            }
+            assert_eq!(left_out.is_empty(), records == written, "{}: {left_out:?}", path.display());
+        }
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(24))]
+
+    /// The user learns of everything that a file does not carry.
+    #[test]
+    fn nothing_is_lost_without_being_counted(
+        records in prop::collection::vec(testing::record(1000), 0..16),
+        compression in prop::sample::select(vec!["", ".gz", ".zst"]),
+    ) {
+        let directory = tempfile::tempdir().unwrap();
+        for format in Format::all() {
+            let path = directory.path().join(file_name(format, compression));
+            let left_out = write(&path, format, &records);
+            let (read, issues) = read(&path);
+            prop_assert_eq!(issues, Vec::<String>::new(), "{}", format);
+            prop_assert_eq!(left_out.is_empty(), read == records, "{}: {:?}\n{:?}\n{:?}", format, left_out, read, records);
+        }
+    }
+
+    /// What a format read can be written again in the same format without loss.
+    #[test]
+    fn a_second_trip_through_the_same_format_changes_nothing(
+        records in prop::collection::vec(testing::record(1), 0..16),
+    ) {
+        let directory = tempfile::tempdir().unwrap();
+        for format in Format::all() {
+            let path = directory.path().join(file_name(format, ""));
+            write(&path, format, &records);
+            let (once, _) = read(&path);
+            write(&path, format, &once);
+            prop_assert_eq!(read(&path).0, once, "{}", format);
+        }
+    }
+}
+
+/// The format that carries everything carries times that no other does.
+#[test]
+fn nanoseconds_and_late_marks_survive_in_our_own_table() {
+    let directory = directory("own_table");
+    let event =
+        TraceEvent::Frame { frame: "123#DEADBEEF".parse().unwrap(), direction: Direction::Tx, late: true };
+    let records = [-1, 0, i64::from(u32::MAX) * 1_000_000_001].map(|time_ns| TraceRecord {
+        time_ns,
+        channel: 255,
+        event,
+    });
+    let path = directory.join("full.csv");
+    assert!(write(&path, Format::Csv(CsvDialect::Full), &records).is_empty());
+    assert_eq!(read(&path), (records.to_vec(), Vec::new()));
+}

@@ -1,0 +1,95 @@
+"""Reads and writes trace files with python-can, for trace_files_agree_with_peers.rs.
+
+dump FILE...             prints "file PATH", then one line for each message
+write LINES FILE...      writes the messages of such lines into each file, format by suffix
+
+A line is: microseconds, channel from 1 (0 where the format has none), Rx or Tx, data, remote, error or fd,
+identifier in hexadecimal, x if it is extended, length, bytes in hexadecimal.
+"""
+
+import sys
+from pathlib import Path
+
+import can
+
+
+def channel_from_1(message, suffix):
+    channel = message.channel
+    if channel is None:
+        return 0
+    if isinstance(channel, str):
+        return int("".join(filter(str.isdigit, channel)) or 0) + 1
+    # The reader of PEAK's files hands the bus number on, the others count from 0.
+    return channel if suffix == ".trc" else channel + 1
+
+
+def line(message, suffix):
+    micros = round(message.timestamp * 1_000_000)
+    direction = "Rx" if message.is_rx else "Tx"
+    if message.is_error_frame:
+        return f"{micros} {channel_from_1(message, suffix)} {direction} error"
+    kind = "fd" if message.is_fd else "remote" if message.is_remote_frame else "data"
+    extended = "x" if message.is_extended_id else "-"
+    data = bytes(message.data).hex().upper() or "-"
+    return (
+        f"{micros} {channel_from_1(message, suffix)} {direction} {kind} {message.arbitration_id:X} {extended} "
+        f"{message.dlc} {data}"
+    )
+
+
+def suffix_of(path):
+    suffixes = [suffix.lower() for suffix in Path(path).suffixes]
+    return next(suffix for suffix in reversed(suffixes) if suffix != ".gz")
+
+
+def reader(path, suffix):
+    # Vector's reader gives times from the start of the measurement unless it is told otherwise.
+    options = {"relative_timestamp": False} if suffix == ".asc" else {}
+    return can.LogReader(path, **options)
+
+
+def dump(paths):
+    for path in paths:
+        print("file", path)
+        suffix = suffix_of(path)
+        for message in reader(path, suffix):
+            print(line(message, suffix))
+
+
+def write(lines, paths):
+    messages = []
+    for text in Path(lines).read_text().splitlines():
+        micros, channel, direction, kind, *rest = text.split()
+        common = {"timestamp": int(micros) / 1_000_000, "is_rx": direction == "Rx", "channel": int(channel) - 1}
+        if kind == "error":
+            messages.append(can.Message(is_error_frame=True, **common))
+            continue
+        identifier, extended, dlc, data = rest
+        messages.append(
+            can.Message(
+                arbitration_id=int(identifier, 16),
+                is_extended_id=extended == "x",
+                is_remote_frame=kind == "remote",
+                dlc=int(dlc),
+                data=None if kind == "remote" or data == "-" else bytes.fromhex(data),
+                check=True,
+                **common,
+            )
+        )
+    for path in paths:
+        # Only the candump log names interfaces.
+        named = suffix_of(path) == ".log"
+        with can.Logger(path) as logger:
+            for message in messages:
+                number = message.channel
+                message.channel = f"can{number}" if named else number
+                logger.on_message_received(message)
+                message.channel = number
+
+
+if __name__ == "__main__":
+    command, *arguments = sys.argv[1:]
+    if command == "dump":
+        dump(arguments)
+    else:
+        write(arguments[0], arguments[1:])

@@ -8,6 +8,8 @@ mod bus;
 #[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
+mod formats;
+#[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
 mod signals;
@@ -25,6 +27,8 @@ use xshell::cmd;
 enum Subject {
     /// Bytes per frame on the wire, and the encoder's cost.
     Wire,
+    /// Converting and reading trace files, against log2asc and python-can.
+    Formats,
     /// Decoding signals, against cantools.
     Signals,
     /// What the firmware's ELF costs and bears on the emulated board.
@@ -67,6 +71,7 @@ pub fn run(args: &Args) -> Result<()> {
     for subject in subjects {
         match subject {
             Subject::Wire => wire::run()?,
+            Subject::Formats => formats::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
             Subject::Bus => bus::run()?,

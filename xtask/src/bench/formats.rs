@@ -1,0 +1,227 @@
+//! Converting and reading trace files, side by side with can-utils' log2asc and python-can: the same million frames of
+//! a ship's bus, from file to file, in one run.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use anyhow::{Context, Result, ensure};
+use cantap::formats::{Format, ReadOptions, TraceReader, WriteOptions, create_writer, open_reader};
+use xshell::{Shell, cmd};
+
+use crate::peers::Peers;
+use crate::workspace;
+
+/// Some ten thousand frames of an NMEA 2000 bus, recorded by candump.
+const RECORDING: &str = "host/tests/data/nmea2000.log.gz";
+/// Frames of the trace made of it.
+const FRAMES: u64 = 1_000_000;
+/// Ours and log2asc take turns so often, and the best of each counts. python-can takes longer than the machine's moods.
+const ROUNDS: usize = 5;
+/// How often the trace is joined to itself where only memory counts.
+const REPEATS: u64 = 5;
+/// What the project promises of a conversion of any length.
+const MOST_MEMORY_BYTES: u64 = 64 * 1024 * 1024;
+
+/// The files, kept in `target/` for whoever wants to look at them.
+struct Files {
+    log: PathBuf,
+    asc: PathBuf,
+    blf: PathBuf,
+    peer_asc: PathBuf,
+    peer_blf: PathBuf,
+    long_blf: PathBuf,
+}
+
+impl Files {
+    fn create() -> Result<Self> {
+        let dir = workspace::target().join("bench-formats");
+        fs::create_dir_all(&dir)?;
+        Ok(Self {
+            log: dir.join("trace.log"),
+            asc: dir.join("cantap.asc"),
+            blf: dir.join("cantap.blf"),
+            peer_asc: dir.join("log2asc.asc"),
+            peer_blf: dir.join("python-can.blf"),
+            long_blf: dir.join("long.blf"),
+        })
+    }
+}
+
+/// Measures speed, then memory.
+pub fn run() -> Result<()> {
+    let shell = workspace::shell()?;
+    let files = Files::create()?;
+    make_trace(&files.log)?;
+    let bytes = fs::metadata(&files.log)?.len();
+    println!(
+        "formats: {FRAMES} frames of {RECORDING} repeated, a candump log of {bytes} bytes, one conversion at a time"
+    );
+    let slow = if let Some(peers) = Peers::find_or_install(&shell)? {
+        compare(&shell, &peers, &files)?
+    } else {
+        println!("{:<16} {:>10}", "", "cantap, s");
+        println!("{:<16} {:>10.3}", "candump to ASC", best(|| convert(&files.log, &files.asc))?);
+        println!("{:<16} {:>10.3}", "candump to BLF", best(|| convert(&files.log, &files.blf))?);
+        println!("{:<16} {:>10.3}", "read BLF", best(|| count(&files.blf))?);
+        Vec::new()
+    };
+    memory(&files)?;
+    ensure!(slow.is_empty(), "not fast enough: {}", slow.join(", "));
+    Ok(())
+}
+
+/// The recording over and over, with times that go on.
+fn make_trace(log: &Path) -> Result<()> {
+    let records: Vec<_> =
+        open_reader(workspace::root().join(RECORDING), &ReadOptions::default())?.collect::<Result<_, _>>()?;
+    let (first, last) = records.first().zip(records.last()).context("the recording is empty")?;
+    let span_ns = last.time_ns - first.time_ns + 1_000_000;
+    let mut writer = create_writer(log, &WriteOptions::default())?;
+    let laps = (0..).flat_map(|lap| records.iter().map(move |record| (lap, *record)));
+    for (lap, mut record) in laps.take(FRAMES as usize) {
+        record.time_ns += lap * span_ns;
+        writer.write(&record)?;
+    }
+    let left_out = writer.finish()?;
+    ensure!(left_out.is_empty(), "the recording does not fit its own format");
+    Ok(())
+}
+
+/// All conversions with ours and a peer's program; which of them are slower than promised.
+fn compare(shell: &Shell, peers: &Peers, files: &Files) -> Result<Vec<&'static str>> {
+    println!(
+        "{:<16} {:>10} {:<12} {:>10} {:>7} {:>9}",
+        "", "cantap, s", "  peer", "its s", "ratio", "at least"
+    );
+    let mut slow = Vec::new();
+    let mut line = |what: &'static str, ours: f64, peer: &str, theirs: f64, least: f64| {
+        println!("{what:<16} {ours:>10.3}   {peer:<10} {theirs:>10.3} {:>6.1}x {least:>8}x", theirs / ours);
+        if theirs < least * ours {
+            slow.push(what);
+        }
+    };
+
+    let (mut ours, mut theirs) = (f64::MAX, f64::MAX);
+    let (log, peer_asc) = (&files.log, &files.peer_asc);
+    for _ in 0..ROUNDS {
+        ours = ours.min(timed(|| convert(log, &files.asc))?);
+        let log2asc =
+            || Ok(cmd!(shell, "log2asc -I {log} -O {peer_asc} can0").quiet().run().map(|()| FRAMES)?);
+        theirs = theirs.min(timed(log2asc)?);
+    }
+    line("candump to ASC", ours, "log2asc", theirs, 8.0);
+
+    let theirs = python_can(shell, peers, &[log, &files.peer_blf])?;
+    line("candump to BLF", best(|| convert(log, &files.blf))?, "python-can", theirs, 30.0);
+
+    let theirs = python_can(shell, peers, &[&files.blf])?;
+    line("read BLF", best(|| count(&files.blf))?, "python-can", theirs, 20.0);
+
+    for (program, file) in [("log2asc", peer_asc), ("python-can", &files.peer_blf), ("cantap", &files.asc)] {
+        let found = count(file)?;
+        ensure!(found == FRAMES, "{program} wrote {found} of {FRAMES} frames into {}", file.display());
+    }
+    Ok(slow)
+}
+
+/// Seconds that python-can takes for a file, or from one to another, without its start.
+fn python_can(shell: &Shell, peers: &Peers, files: &[&Path]) -> Result<f64> {
+    let (python, script) = (&peers.python, "xtask/src/bench/formats.py");
+    let output = cmd!(shell, "{python} {script} {files...}").quiet().read()?;
+    let (messages, seconds) = output.split_once(' ').context("the script prints two numbers")?;
+    let messages: u64 = messages.parse()?;
+    ensure!(messages == FRAMES, "python-can finds {messages} of {FRAMES} messages in {}", files[0].display());
+    Ok(seconds.parse()?)
+}
+
+/// The most memory that this program occupies while it converts traces of one length and of several times
+/// that.
+fn memory(files: &Files) -> Result<()> {
+    if !reset_peak_memory() {
+        println!("memory is not measured: this system has no /proc/self/clear_refs");
+        return Ok(());
+    }
+    let mut most_bytes = 0;
+    let mut line = |what: &str, repeats: u64| -> Result<()> {
+        let bytes = peak_memory_bytes()?;
+        reset_peak_memory();
+        println!(
+            "{what:<16} {:>10} frames: at most {:>5.1} MiB",
+            FRAMES * repeats,
+            bytes as f64 / 1_048_576.0
+        );
+        most_bytes = bytes.max(most_bytes);
+        Ok(())
+    };
+    for repeats in [1, REPEATS] {
+        let mut log: Box<dyn Read + Send> = Box::new(std::io::empty());
+        for _ in 0..repeats {
+            log = Box::new(log.chain(File::open(&files.log)?));
+        }
+        let reader = TraceReader::from_source("the trace", log, Format::Candump, &ReadOptions::default())?;
+        copy(reader, &files.long_blf)?;
+        line("candump to BLF", repeats)?;
+        let found = convert(&files.long_blf, &files.asc)?;
+        ensure!(found == repeats * FRAMES, "a long trace has {found} frames");
+        line("BLF to ASC", repeats)?;
+    }
+    fs::remove_file(&files.long_blf)?;
+    ensure!(most_bytes < MOST_MEMORY_BYTES, "a conversion takes {most_bytes} bytes of memory");
+    Ok(())
+}
+
+/// Begins the measurement of the peak anew, where the system can.
+fn reset_peak_memory() -> bool {
+    fs::write("/proc/self/clear_refs", "5").is_ok()
+}
+
+/// The most memory this process had resident since the last reset.
+fn peak_memory_bytes() -> Result<u64> {
+    let status = fs::read_to_string("/proc/self/status")?;
+    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
+    let kilobytes =
+        line.and_then(|line| line.trim().strip_suffix(" kB")).context("no VmHWM in the status")?;
+    Ok(kilobytes.parse::<u64>()? * 1024)
+}
+
+/// From one file to another, as `cantap convert` does it; how many frames.
+fn convert(from: &Path, to: &Path) -> Result<u64> {
+    copy(open_reader(from, &ReadOptions::default())?, to)
+}
+
+fn copy(reader: TraceReader, to: &Path) -> Result<u64> {
+    let mut writer = create_writer(to, &WriteOptions::default())?;
+    let mut frames = 0;
+    for record in reader {
+        writer.write(&record?)?;
+        frames += 1;
+    }
+    writer.finish()?;
+    Ok(frames)
+}
+
+/// How many frames a file has.
+fn count(file: &Path) -> Result<u64> {
+    let mut frames = 0;
+    for record in open_reader(file, &ReadOptions::default())? {
+        std::hint::black_box(record?);
+        frames += 1;
+    }
+    Ok(frames)
+}
+
+/// The fastest of several rounds, in seconds.
+fn best(mut work: impl FnMut() -> Result<u64>) -> Result<f64> {
+    (0..ROUNDS).try_fold(f64::MAX, |best, _| Ok(timed(&mut work)?.min(best)))
+}
+
+/// Seconds of one round.
+fn timed(mut work: impl FnMut() -> Result<u64>) -> Result<f64> {
+    let begin = Instant::now();
+    let frames = work()?;
+    let seconds = begin.elapsed().as_secs_f64();
+    ensure!(frames == FRAMES, "{frames} of {FRAMES} frames");
+    Ok(seconds)
+}

@@ -1,0 +1,9 @@
+//! Any bytes as DIF files.
+
+#![no_main]
+
+mod trace;
+
+use cantap::formats::Format;
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| trace::read(Format::Dif, bytes));

@@ -6,7 +6,9 @@
 mod testing;
 mod traces;
 
-use cantap::formats::{CsvDialect, Format, TrcVersion};
+use cantap::formats::{
+    CsvDialect, DifConvention, Format, LineEnd, TableStyle, TrcVersion, WriteOptions, create_writer,
+};
 // `testing` takes them from here.
 use cantap::{Direction, TraceEvent, TraceRecord};
 use proptest::prelude::*;
@@ -94,4 +96,30 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table() {
     let path = directory.join("full.csv");
     assert!(write(&path, Format::Csv(CsvDialect::Full), &records).is_empty());
     assert_eq!(read(&path), (records.to_vec(), Vec::new()));
+}
+
+/// Reading finds out by itself which spreadsheet a table was written for.
+#[test]
+fn the_earlier_analysers_tables_read_back_in_every_style() {
+    let directory = directory("table_styles");
+    let records = real(300);
+    for (separator, decimal_mark) in [(b';', b','), (b',', b'.'), (b'\t', b','), (b';', b'.')] {
+        for line_end in [LineEnd::CrLf, LineEnd::Lf] {
+            for dif in [DifConvention::Columns, DifConvention::Rows] {
+                let table = TableStyle { separator, decimal_mark, line_end, dif };
+                for format in [Format::Csv(CsvDialect::Analyser), Format::Dif] {
+                    let path = directory.join(file_name(format, ""));
+                    let options = WriteOptions { format: Some(format), table, ..WriteOptions::default() };
+                    let mut writer = create_writer(&path, &options).unwrap();
+                    for record in &records {
+                        writer.write(record).unwrap();
+                    }
+                    assert!(writer.finish().unwrap().is_empty());
+                    let (read, issues) = read(&path);
+                    assert_eq!(issues, Vec::<String>::new(), "{format} {table:?}");
+                    assert!(read == records, "{format} {table:?}: {} of {}", read.len(), records.len());
+                }
+            }
+        }
+    }
 }

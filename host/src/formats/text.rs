@@ -132,6 +132,34 @@ pub(crate) fn hex(digits: &[u8]) -> Option<u32> {
     Some(value)
 }
 
+/// Sixteen hexadecimal digits as eight bytes. One test at the end instead of one per byte: this is the inner loop of
+/// reading a log.
+#[inline]
+pub(crate) fn eight_bytes(digits: &[u8; 16]) -> Option<[u8; 8]> {
+    let mut bytes = [0; 8];
+    let mut seen = 0;
+    for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
+        let (high, low) = (HEX_VALUES[pair[0] as usize], HEX_VALUES[pair[1] as usize]);
+        seen |= high | low;
+        *byte = high << 4 | low;
+    }
+    (seen < 16).then_some(bytes)
+}
+
+/// A decimal number of exactly so many digits, at most 18, tested once for all of them.
+#[inline]
+pub(crate) fn digits<const N: usize>(digits: &[u8; N]) -> Option<i64> {
+    const { assert!(N <= 18, "more digits than an i64 holds") };
+    let mut value = 0_i64;
+    let mut all = true;
+    for digit in digits {
+        let digit = digit.wrapping_sub(b'0');
+        all &= digit < 10;
+        value = value * 10 + i64::from(digit);
+    }
+    all.then_some(value)
+}
+
 /// A decimal number.
 #[inline]
 pub(crate) fn decimal(digits: &[u8]) -> Option<u64> {
@@ -233,6 +261,12 @@ mod tests {
             prop_assert_eq!(hex_len(id), format!("{id:x}").len());
             let pair = text(|out| push_hex_byte(out, byte)).into_bytes();
             prop_assert_eq!(hex_pair(pair[0], pair[1]), Some(byte));
+            let sixteen = format!("{value:016x}").into_bytes();
+            prop_assert_eq!(eight_bytes(sixteen.first_chunk().unwrap()), Some(value.to_be_bytes()));
+            let ten = format!("{id:010}").into_bytes();
+            prop_assert_eq!(digits::<10>(ten.first_chunk().unwrap()), Some(i64::from(id)));
+            prop_assert_eq!(digits(b"12:4"), None);
+            prop_assert_eq!(eight_bytes(b"0123456789ABCDEG"), None);
             // The extreme second cannot be written without overflow on the way back.
             let time_ns = time_ns.clamp(-i64::MAX, i64::MAX);
             let written = text(|out| push_time(out, time_ns, NS_PER_S, 9, b'.'));

@@ -51,7 +51,7 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
-    /// A data frame exactly as candump writes it in this century, as most lines are: everything at its place, so
+    /// A data frame exactly as candump writes it, with ten digits of seconds, as most lines are: everything at its place, so
     /// nothing is searched for. `None` is no verdict: [`Self::parse`] looks at the line then.
     #[inline]
     fn plain(&mut self, line: &[u8]) -> Option<TraceRecord> {

@@ -33,10 +33,16 @@ const HEX_VALUES: [u8; 256] = {
     values
 };
 
+/// A byte's two hexadecimal digits.
+#[inline]
+pub(crate) fn hex_pair_of(byte: u8) -> [u8; 2] {
+    HEX_PAIRS[byte as usize]
+}
+
 /// Appends a byte as two hexadecimal digits.
 #[inline]
 pub(crate) fn push_hex_byte(out: &mut Vec<u8>, byte: u8) {
-    out.extend_from_slice(&HEX_PAIRS[byte as usize]);
+    out.extend_from_slice(&hex_pair_of(byte));
 }
 
 /// Appends the low `digits` (1 to 8) hexadecimal digits of a value.
@@ -55,7 +61,12 @@ pub(crate) const fn hex_len(value: u32) -> usize {
 /// Appends a decimal number.
 #[inline]
 pub(crate) fn push_decimal(out: &mut Vec<u8>, value: u64) {
-    push_padded(out, value, 1);
+    // Channels and lengths, which most numbers are.
+    if value < 10 {
+        out.push(b'0' + value as u8);
+    } else {
+        push_padded(out, value, 1);
+    }
 }
 
 /// Appends a decimal number with leading zeros up to `width` (at most 20) digits.
@@ -73,6 +84,9 @@ pub(crate) fn push_padded(out: &mut Vec<u8>, mut value: u64, width: usize) {
 
 /// Appends `value_ns` as seconds (or another unit of `unit_ns` nanoseconds, a power of ten) with
 /// `decimals` digits after `mark`, rounded down.
+///
+/// Inlined, because the unit is a constant wherever this is used, and three divisions by it are then none.
+#[inline]
 pub(crate) fn push_time(out: &mut Vec<u8>, value_ns: i64, unit_ns: i64, decimals: u32, mark: u8) {
     let step = (unit_ns / 10_i64.pow(decimals)).max(1);
     let steps = value_ns.div_euclid(step);
@@ -92,8 +106,10 @@ pub(crate) fn push_time(out: &mut Vec<u8>, value_ns: i64, unit_ns: i64, decimals
 pub(crate) fn pad_left(out: &mut Vec<u8>, start: usize, width: usize) {
     let missing = width.saturating_sub(out.len() - start);
     if missing > 0 {
-        out.resize(out.len() + missing, b' ');
-        out[start..].rotate_right(missing);
+        let end = out.len();
+        out.resize(end + missing, b' ');
+        out.copy_within(start..end, start + missing);
+        out[start..start + missing].fill(b' ');
     }
 }
 
@@ -264,8 +280,8 @@ mod tests {
             let sixteen = format!("{value:016x}").into_bytes();
             prop_assert_eq!(eight_bytes(sixteen.first_chunk().unwrap()), Some(value.to_be_bytes()));
             let ten = format!("{id:010}").into_bytes();
-            prop_assert_eq!(digits::<10>(ten.first_chunk().unwrap()), Some(i64::from(id)));
-            prop_assert_eq!(digits(b"12:4"), None);
+            prop_assert_eq!(super::digits::<10>(ten.first_chunk().unwrap()), Some(i64::from(id)));
+            prop_assert_eq!(super::digits(b"12:4"), None);
             prop_assert_eq!(eight_bytes(b"0123456789ABCDEG"), None);
             // The extreme second cannot be written without overflow on the way back.
             let time_ns = time_ns.clamp(-i64::MAX, i64::MAX);

@@ -54,10 +54,7 @@ impl Encode for Encoder {
             Some(start_ns) => start_ns,
             None => self.head(record.time_ns, out),
         };
-        let at = out.len();
-        text::push_time(out, record.time_ns.saturating_sub(start_ns), NS_PER_S, 6, b'.');
-        text::pad_left(out, at, TIME_WIDTH);
-        out.push(b' ');
+        push_offset(out, record.time_ns.saturating_sub(start_ns));
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
                 text::push_decimal(out, u64::from(record.channel));
@@ -74,10 +71,13 @@ impl Encode for Encoder {
                 out.extend_from_slice(if *direction == Direction::Tx { b"Tx   " } else { b"Rx   " });
                 out.extend_from_slice(if frame.is_remote() { b"r " } else { b"d " });
                 text::push_hex(out, u32::from(frame.dlc()), 1);
-                for byte in frame.data() {
-                    out.push(b' ');
-                    text::push_hex_byte(out, *byte);
+                // One append for all bytes.
+                let mut columns = [b' '; 3 * 8];
+                let data = frame.data();
+                for (column, byte) in columns.chunks_exact_mut(3).zip(data) {
+                    column[1..].copy_from_slice(&text::hex_pair_of(*byte));
                 }
+                out.extend_from_slice(&columns[..3 * data.len()]);
             }
             TraceEvent::BusError { kind, .. } => {
                 text::push_decimal(out, u64::from(record.channel));
@@ -115,6 +115,36 @@ impl Encode for Encoder {
         }
         out.extend_from_slice(b"End TriggerBlock\n");
     }
+}
+
+/// A time since the start in seconds, right-aligned, and a space.
+#[inline]
+fn push_offset(out: &mut Vec<u8>, offset_ns: i64) {
+    const US_PER_S: u64 = 1_000_000;
+    let us = offset_ns as u64 / 1000;
+    // Up to four digits of seconds the column is filled in place, without moving text.
+    if offset_ns < 0 || us >= 10_000 * US_PER_S {
+        let at = out.len();
+        text::push_time(out, offset_ns, NS_PER_S, 6, b'.');
+        text::pad_left(out, at, TIME_WIDTH);
+        out.push(b' ');
+        return;
+    }
+    let mut column = [b' '; TIME_WIDTH + 1];
+    let (mut seconds, mut fraction) = ((us / US_PER_S) as u32, (us % US_PER_S) as u32);
+    for digit in column[5..TIME_WIDTH].iter_mut().rev() {
+        *digit = b'0' + (fraction % 10) as u8;
+        fraction /= 10;
+    }
+    column[4] = b'.';
+    for digit in column[..4].iter_mut().rev() {
+        *digit = b'0' + (seconds % 10) as u8;
+        seconds /= 10;
+        if seconds == 0 {
+            break;
+        }
+    }
+    out.extend_from_slice(&column);
 }
 
 fn push_status(out: &mut Vec<u8>, channel: u8) {

@@ -350,9 +350,12 @@ fn inflate(decompressor: &mut Decompress, mut data: &[u8], expected_len: usize, 
 #[inline]
 fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceEvent)>, Fault> {
     let need = |len: usize| {
-        let found = format!("{} bytes", fields.len());
-        let expected = || format!("at least {len} bytes of fields in an object of type {kind}");
-        if fields.len() < len { Err(Fault::malformed(expected(), found.as_bytes())) } else { Ok(()) }
+        let found = fields.len();
+        if found >= len {
+            return Ok(());
+        }
+        let expected = format!("at least {len} bytes of fields in an object of type {kind}");
+        Err(Fault::malformed(expected, format!("{found} bytes").as_bytes()))
     };
     let channel = u8::try_from(u16_at(fields, 0)).unwrap_or(u8::MAX);
     let unknown_error = TraceEvent::BusError { kind: None, counters: None };

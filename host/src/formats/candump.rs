@@ -69,8 +69,7 @@ impl Decoder {
         let id = if id.len() == 8 { Id::extended(raw) } else { Id::standard(raw) }?;
         let (digits, direction) = match rest {
             [digits @ .., b' ', b'T'] => (digits, Direction::Tx),
-            [digits @ .., b' ', b'R'] => (digits, Direction::Rx),
-            digits => (digits, Direction::Rx),
+            [digits @ .., b' ', b'R'] | digits => (digits, Direction::Rx),
         };
         let (data, len) = match <&[u8; 16]>::try_from(digits) {
             Ok(digits) => (text::eight_bytes(digits)?, 8),

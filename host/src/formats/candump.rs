@@ -58,7 +58,10 @@ impl Decoder {
         let (time, rest) = line.split_first_chunk::<20>()?;
         let [b'(', seconds @ .., b'.', u0, u1, u2, u3, u4, u5, b')', b' '] = time else { return None };
         let seconds = text::digits(seconds.first_chunk::<10>()?)?;
+        // Ten digits reach beyond the year 2262, where nanoseconds no longer fit.
+        let seconds_ns = seconds.checked_mul(NS_PER_S)?;
         let us = text::digits(&[*u0, *u1, *u2, *u3, *u4, *u5])?;
+        let time_ns = seconds_ns.checked_add(us * 1000)?;
         let (interface, rest) = split_at_byte(rest, b' ')?;
         let (id, rest) = match rest {
             _ if rest.get(8) == Some(&b'#') => (&rest[..8], &rest[9..]),
@@ -79,7 +82,7 @@ impl Decoder {
         let channel = self.interfaces.channel(interface);
         let frame = Frame::from_bus(id, false, len, data);
         let event = TraceEvent::Frame { frame, direction, late: false };
-        Some(TraceRecord { time_ns: seconds * NS_PER_S + us * 1000, channel, event })
+        Some(TraceRecord { time_ns, channel, event })
     }
 
     /// One line's record, and a second event if it says two things.
@@ -237,6 +240,12 @@ mod tests {
                 prop_assert_eq!(long.parse(line.as_bytes()).ok(), Some((record, None)));
             }
         }
+    }
+
+    #[test]
+    fn a_time_beyond_nanoseconds_is_refused_and_not_wrapped() {
+        let (records, issues) = tests::read(Format::Candump, "(9999999999.000000) can0 123#11\n");
+        assert_eq!((records.len(), issues.len()), (0, 1));
     }
 
     #[test]

@@ -68,15 +68,59 @@ pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], Framing
     if out.len() < encoded.len() {
         return Err(FramingError::Cobs);
     }
-    let len = cobs::decode(encoded, out).map_err(|_| FramingError::Cobs)?.frame_size();
+    let len = decode_cobs(encoded, out).ok_or(FramingError::Cobs)?;
     let body = len.checked_sub(CRC_LEN).ok_or(FramingError::Short)?;
     let (message, crc) = out[..len].split_at(body);
     if CRC.checksum(message).to_le_bytes() == crc { Ok(message) } else { Err(FramingError::Crc) }
 }
 
+/// Decodes COBS in whole runs: `cobs::decode` goes byte by byte, which costs the host a fifth of its decoding.
+fn decode_cobs(mut encoded: &[u8], out: &mut [u8]) -> Option<usize> {
+    let mut len = 0;
+    while let Some((&code, rest)) = encoded.split_first() {
+        let (run, rest) = rest.split_at_checked(usize::from(code).checked_sub(1)?)?;
+        out.get_mut(len..len + run.len())?.copy_from_slice(run);
+        len += run.len();
+        // Each run but a full one stands for a zero behind it, except at the end.
+        if code != u8::MAX && !rest.is_empty() {
+            *out.get_mut(len)? = 0;
+            len += 1;
+        }
+        encoded = rest;
+    }
+    Some(len)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn cobs_decodes_what_the_crate_encodes(
+            // Few zeros, so that there are full runs; or many.
+            message in prop_oneof![
+                proptest::collection::vec(0..=255u8, 0..600),
+                proptest::collection::vec(0..3u8, 0..600),
+                proptest::collection::vec(1..=255u8, 250..520),
+            ],
+        ) {
+            let mut encoded = [0; 1024];
+            let encoded_len = cobs::encode(&message, &mut encoded);
+            let mut decoded = [0; 1024];
+            let len = decode_cobs(&encoded[..encoded_len], &mut decoded).unwrap();
+            prop_assert_eq!(&decoded[..len], &message[..]);
+        }
+
+        #[test]
+        fn cobs_takes_any_bytes_without_a_panic(bytes: Vec<u8>, room in 0..300usize) {
+            let mut out = [0; 300];
+            if let Some(len) = decode_cobs(&bytes, &mut out[..room]) {
+                prop_assert!(len <= room);
+            }
+        }
+    }
 
     #[test]
     fn the_crc_is_the_one_of_ethernet() {

@@ -127,7 +127,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let summary = Summary {
         seconds: rounded(books.meters.iter().map(Meter::seconds).fold(0.0, f64::max), 3),
         channels: Channel::ALL.map(|channel| books.summarize(channel, heard)).into(),
-        wire_bytes_per_frame: rounded((counters.bytes - bytes_before) as f64 / received.max(1) as f64, 3),
+        wire_bytes_per_frame: per_frame(counters.bytes - bytes_before, received),
         queue_bytes: device.hello().queue_bytes,
         queue_high_water_bytes: status.queue_high_water_bytes,
         lost: Losses::of(&counters),
@@ -183,6 +183,10 @@ fn drain(records: &mut Records, books: &mut Books, file: &mut TraceFile) -> anyh
         file.writer.write(&record).context("the trace cannot be written; make room on the disk")?;
     }
     Ok(())
+}
+
+fn per_frame(bytes: u64, frames: u64) -> f64 {
+    if frames == 0 { 0.0 } else { rounded(bytes as f64 / frames as f64, 3) }
 }
 
 fn progress_bar(length: Duration, hidden: bool) -> ProgressBar {

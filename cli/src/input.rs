@@ -14,16 +14,16 @@ use crate::live::{LiveArgs, LiveRecords};
 pub struct ReadArgs {
     /// The trace's format, where the file's name does not tell.
     #[arg(long, value_name = "FORMAT")]
-    format: Option<Format>,
+    pub format: Option<Format>,
     /// Wait for more at the end of the file, until Ctrl-C.
     #[arg(long)]
-    follow: bool,
+    pub follow: bool,
     /// Stop at the first thing that is wrong instead of leaving it out.
     #[arg(long)]
     pub strict: bool,
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Repeat for any of several.
     #[arg(short, long, value_name = "FILTER")]
-    filter: Vec<Filter>,
+    pub filter: Vec<Filter>,
 }
 
 /// Broken lines are told one by one until it is clear that the whole file is.
@@ -72,6 +72,21 @@ impl Records {
             Source::File(_, grows) => *grows,
             Source::Device(live) => !live.has_next(),
         }
+    }
+
+    /// Ends the trace as soon as this is true.
+    pub fn end_when(&mut self, stop: fn() -> bool) {
+        self.reader.end_when(stop);
+    }
+
+    /// Whether the next record of a live trace may have to be waited for.
+    pub fn would_wait(&self) -> bool {
+        self.live && self.reader.would_wait()
+    }
+
+    /// How many places could not be read so far.
+    pub fn issues(&self) -> u64 {
+        self.reader.issues()
     }
 
     /// The next record that passes the filters; `None` at the end. With `--strict`, an issue is an error.

@@ -33,6 +33,8 @@ pub mod transmit;
 pub mod trigger;
 #[cfg(feature = "virtual")]
 pub mod virtual_device;
+#[cfg(feature = "formats")]
+pub mod window;
 
 pub use bits::{FrameBits, bits_on_bus};
 pub use cantap_wire as wire;

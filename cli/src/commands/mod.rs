@@ -5,6 +5,7 @@ pub mod bits;
 pub mod capture;
 pub mod care;
 pub mod completions;
+pub mod convert;
 pub mod decode;
 pub mod demo;
 pub mod diff;
@@ -35,6 +36,8 @@ pub enum Command {
     Plot(plot::Args),
     /// Measure a trace or a bus: load, rates, periods, losses, errors.
     Stats(stats::Args),
+    /// Convert a trace from any format to any other: filtered, cut out, split.
+    Convert(convert::Args),
     /// Show what two traces say differently: IDs, periods, lengths, bits.
     Diff(diff::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
@@ -84,6 +87,7 @@ impl Command {
             Self::Monitor(args) => monitor::run(&args),
             Self::Plot(args) => plot::run(&args),
             Self::Stats(args) => stats::run(&args),
+            Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),

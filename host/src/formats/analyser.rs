@@ -409,8 +409,8 @@ impl RowDecoder {
 }
 
 /// `2014-09-14 17:14:42.622`, or `14/09/2014 17:14:42`.
-fn date(text: &str) -> Option<i64> {
-    let (day, clock) = text.split_once(' ')?;
+pub(crate) fn date(text: &str) -> Option<i64> {
+    let (day, clock) = text.split_once([' ', 'T'])?;
     let numbers: Vec<i64> = day.split(['-', '/', '.']).map(str::parse).collect::<Result<_, _>>().ok()?;
     let (year, month, day) = match numbers[..] {
         [year, month, day] | [day, month, year] if year >= 1000 => (year, month, day),

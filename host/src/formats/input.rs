@@ -34,6 +34,7 @@ pub(crate) struct Input {
     follow: bool,
     ended: bool,
     cut: bool,
+    stop: Box<dyn Fn() -> bool + Send>,
 }
 
 /// One line, without its end.
@@ -73,6 +74,7 @@ impl Input {
             follow,
             ended: false,
             cut: false,
+            stop: Box::new(|| false),
         }
     }
 
@@ -112,6 +114,16 @@ impl Input {
         io::Cursor::new(buffered).chain(self.source)
     }
 
+    /// Ends the input as soon as this is true.
+    pub(crate) fn end_when(&mut self, stop: Box<dyn Fn() -> bool + Send>) {
+        self.stop = stop;
+    }
+
+    /// Whether everything read so far is used up.
+    pub(crate) fn is_used_up(&self) -> bool {
+        self.start == self.end
+    }
+
     /// Whether compressed data ended before its own end mark.
     pub(crate) fn compressed_data_cut(&self) -> bool {
         self.cut
@@ -140,9 +152,14 @@ impl Input {
         if self.buffer.len() < self.end + CHUNK_BYTES {
             self.buffer.resize(self.end + CHUNK_BYTES, 0);
         }
+        // A source that never ends is left when asked; what it gave is still read.
+        if (self.stop)() {
+            self.ended = true;
+            return Ok(false);
+        }
         loop {
             match self.source.read(&mut self.buffer[self.end..]) {
-                Ok(0) if self.follow => std::thread::sleep(FOLLOW_INTERVAL),
+                Ok(0) if self.follow && !(self.stop)() => std::thread::sleep(FOLLOW_INTERVAL),
                 Ok(0) => {
                     self.ended = true;
                     return Ok(false);

@@ -29,6 +29,7 @@ mod text;
 mod trc;
 mod writer;
 
+pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
 pub use csv::CsvDialect;
 pub use format::{Format, UnknownFormat};
@@ -37,3 +38,8 @@ pub use reader::{OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotate::{BadRotation, RotateAt, Rotation};
 pub use trc::TrcVersion;
 pub use writer::{LeftOut, TraceWriter, WriteOptions, create_writer};
+
+/// Seconds with a fraction, as nanoseconds.
+pub(crate) fn decimal_seconds_ns(text: &str) -> Option<i64> {
+    text::time(text.as_bytes(), text::NS_PER_S, b'.')
+}

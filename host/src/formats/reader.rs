@@ -113,6 +113,16 @@ impl TraceReader {
         self.format
     }
 
+    /// While waiting for more of a file that is followed, ends as soon as this is true.
+    pub fn end_when(&mut self, stop: impl Fn() -> bool + Send + 'static) {
+        self.input.end_when(Box::new(stop));
+    }
+
+    /// Whether the next record may have to be waited for: what was read before is used up.
+    pub fn would_wait(&self) -> bool {
+        self.input.is_used_up()
+    }
+
     /// How many issues have come so far.
     pub fn issues(&self) -> u64 {
         self.issues

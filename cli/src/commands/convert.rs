@@ -1,0 +1,189 @@
+//! `cantap convert`: from any trace format to any other.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use anyhow::{Context, bail};
+use cantap::filter::Filter;
+use cantap::formats::{
+    DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, create_writer,
+};
+use cantap::window::{TimePoint, Window};
+
+use crate::input::ReadArgs;
+use crate::interrupt;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap convert trace.log trace.blf\n  \
+    cantap convert trace.asc.gz - --filter can0,123:7FF | canplayer\n  \
+    cantap convert day.blf part.csv --start 10m --end 20m --channel 1\n  \
+    cantap convert trace.pcapng old.trc --format trc1.1\n  \
+    cantap convert - days.log.zst --rotate 100M --keep 10\n\n\
+    Names end in .log, .asc, .blf, .trc, .csv, .pcapng or .dif; .gz and .zst behind that compress. Dates in \
+    ASC, TRC and BLF are UTC.\n\n\
+    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, or with --strict \
+    something in IN was wrong.")]
+pub struct Args {
+    /// The trace to read; - for standard input.
+    #[arg(value_name = "IN")]
+    input: PathBuf,
+    /// The trace to write; - for standard output.
+    #[arg(value_name = "OUT")]
+    output: PathBuf,
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Any of several.
+    #[arg(value_name = "FILTER")]
+    filters: Vec<Filter>,
+    /// The format of OUT, where its name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
+    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, dif.
+    #[arg(long, visible_alias = "to", value_name = "FORMAT")]
+    format: Option<Format>,
+    /// The format of IN, where neither its name nor its beginning tell.
+    #[arg(long, value_name = "FORMAT")]
+    from: Option<Format>,
+    /// Wait for more at the end of IN, until Ctrl-C.
+    #[arg(long)]
+    follow: bool,
+    /// Stop at the first thing in IN that is wrong instead of leaving it out.
+    #[arg(long)]
+    strict: bool,
+    /// Only these frames, as FILTER.
+    #[arg(short, long = "filter", value_name = "FILTER")]
+    filter_options: Vec<Filter>,
+    /// Only this channel, from 1. Repeat for any of several.
+    #[arg(short, long, value_name = "N")]
+    channel: Vec<u8>,
+    /// From here on: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in UTC.
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    start: Option<TimePoint>,
+    /// Up to here, exclusive.
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    end: Option<TimePoint>,
+    #[command(flatten)]
+    write: WriteArgs,
+    /// Print the numbers as a JSON object, to standard error if the trace goes to standard output.
+    #[arg(long)]
+    json: bool,
+}
+
+/// How to write; for other commands to flatten too.
+#[derive(clap::Args)]
+pub struct WriteArgs {
+    /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
+    #[arg(long, value_name = "SIZE|TIME")]
+    rotate: Vec<RotateAt>,
+    /// Keep only so many of these files: the oldest are deleted.
+    #[arg(long, value_name = "N", requires = "rotate", value_parser = clap::value_parser!(u32).range(1..))]
+    keep: Option<u32>,
+    /// What separates the columns of the earlier analyser's CSV.
+    #[arg(long, value_name = "CHARACTER", default_value = ";", value_parser = character)]
+    separator: u8,
+    /// What separates fractions in the earlier analyser's tables.
+    #[arg(long, value_name = "CHARACTER", default_value = ",", value_parser = character)]
+    decimal_mark: u8,
+    /// How lines of the earlier analyser's tables end.
+    #[arg(long, value_name = "END", default_value = "crlf", value_parser = ["crlf", "lf"])]
+    line_end: String,
+    /// What VECTORS counts in DIF, and whether V or an empty line follows a number: columns and V, or rows.
+    #[arg(long, value_name = "CONVENTION", default_value = "columns", value_parser = ["columns", "rows"])]
+    dif: String,
+}
+
+fn character(text: &str) -> Result<u8, String> {
+    match text {
+        "tab" | "\\t" => Ok(b'\t'),
+        _ => match text.as_bytes() {
+            [character] if character.is_ascii_punctuation() || *character == b' ' => Ok(*character),
+            _ => Err("write one character such as ; or , or tab".to_owned()),
+        },
+    }
+}
+
+impl WriteArgs {
+    /// The library's options.
+    pub fn options(&self, format: Option<Format>) -> anyhow::Result<WriteOptions> {
+        if self.separator == self.decimal_mark {
+            bail!("the separator and the decimal mark are the same character; choose different ones");
+        }
+        let rotation = Rotation { at: self.rotate.clone(), keep: self.keep.map(|keep| keep as usize) };
+        let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
+        let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
+        let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
+        Ok(WriteOptions { format, rotation, table })
+    }
+}
+
+/// How a file is called in messages.
+pub fn shown(path: &Path) -> String {
+    if path.as_os_str() == "-" { "standard output".to_owned() } else { path.display().to_string() }
+}
+
+/// Says what a finished file could not carry.
+pub fn report(left_out: &cantap::formats::LeftOut, path: &Path) {
+    for (what, count) in left_out.iter() {
+        eprintln!("cantap: {} does not carry {what} ({count})", shown(path));
+    }
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    refuse_same_file(&args.input, &args.output)?;
+    let options = args.write.options(args.format)?;
+    let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
+    let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter };
+    let mut records = read.open(&args.input)?;
+    if records.is_live() {
+        interrupt::watch()?;
+        records.end_when(interrupt::requested);
+    }
+    let failed = || format!("cannot write {}", shown(&args.output));
+    let mut writer = create_writer(&args.output, &options).with_context(failed)?;
+    let mut window = Window::new(args.start, args.end);
+    let mut written = 0_u64;
+    // What came until an error is kept: the file is finished all the same.
+    let read = loop {
+        match records.next() {
+            Ok(Some(record)) => {
+                // The window's first record is the trace's, whatever the channel.
+                let inside = window.contains(&record);
+                if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
+                    writer.write(&record).with_context(failed)?;
+                    written += 1;
+                }
+                if records.would_wait() {
+                    writer.flush().with_context(failed)?;
+                }
+            }
+            Ok(None) => break Ok(()),
+            Err(error) => break Err(error),
+        }
+    };
+    let left_out = writer.finish().with_context(failed)?;
+    report(&left_out, &args.output);
+    read?;
+    if args.json {
+        let left_out: serde_json::Map<_, _> =
+            left_out.iter().map(|(what, count)| (what.to_owned(), count.into())).collect();
+        let summary = serde_json::json!({
+            "records": written,
+            "issues": records.issues(),
+            "left_out": left_out,
+        });
+        if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Creating OUT empties it: if it is IN, the trace would be gone.
+fn refuse_same_file(input: &Path, output: &Path) -> anyhow::Result<()> {
+    if input.as_os_str() == "-" || output.as_os_str() == "-" {
+        return Ok(());
+    }
+    if let (Ok(input), Ok(same)) = (input.canonicalize(), output.canonicalize())
+        && input == same
+    {
+        bail!("{} is both input and output; choose another name for the output", output.display());
+    }
+    Ok(())
+}

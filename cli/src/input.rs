@@ -69,24 +69,28 @@ impl Records {
     /// Whether the next record may take a while, so that results should not wait in a buffer.
     pub fn may_wait(&self) -> bool {
         match &self.source {
-            Source::File(_, grows) => *grows,
+            Source::File(reader, grows) => *grows && reader.would_wait(),
             Source::Device(live) => !live.has_next(),
         }
     }
 
-    /// Ends the trace as soon as this is true.
-    pub fn end_when(&mut self, stop: fn() -> bool) {
-        self.reader.end_when(stop);
+    /// Ends a file that grows as soon as this is true; says whether it is one.
+    pub fn end_when(&mut self, stop: fn() -> bool) -> bool {
+        match &mut self.source {
+            Source::File(reader, true) => {
+                reader.end_when(stop);
+                true
+            }
+            _ => false,
+        }
     }
 
-    /// Whether the next record of a live trace may have to be waited for.
-    pub fn would_wait(&self) -> bool {
-        self.live && self.reader.would_wait()
-    }
-
-    /// How many places could not be read so far.
+    /// How many places of a file could not be read so far.
     pub fn issues(&self) -> u64 {
-        self.reader.issues()
+        match &self.source {
+            Source::File(reader, _) => reader.issues(),
+            Source::Device(_) => 0,
+        }
     }
 
     /// The next record that passes the filters; `None` at the end. With `--strict`, an issue is an error.

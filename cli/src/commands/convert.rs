@@ -133,9 +133,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter };
     let mut records = read.open(&args.input)?;
-    if records.is_live() {
+    if records.end_when(interrupt::requested) {
         interrupt::watch()?;
-        records.end_when(interrupt::requested);
     }
     let failed = || format!("cannot write {}", shown(&args.output));
     let mut writer = create_writer(&args.output, &options).with_context(failed)?;
@@ -151,7 +150,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                     writer.write(&record).with_context(failed)?;
                     written += 1;
                 }
-                if records.would_wait() {
+                if records.may_wait() {
                     writer.flush().with_context(failed)?;
                 }
             }

@@ -1,0 +1,167 @@
+//! `cantap convert` as users run it.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output, Stdio};
+
+const TRACE: &str = "(1410714882.000000) can0 123#1122\n\
+                     (1410714883.000000) can1 1F334455#AA T\n\
+                     (1410714884.000000) can0 124#R2\n\
+                     (1410714885.000000) can0 20000088#0000040000000000\n\
+                     (1410714886.500000) can1 400#\n";
+
+/// An empty directory for each test, but for the trace.
+fn directory(test: &str) -> PathBuf {
+    let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("convert").join(test);
+    // A run before may have left files that would be counted.
+    let _ = fs::remove_dir_all(&directory);
+    fs::create_dir_all(&directory).unwrap();
+    fs::write(directory.join("trace.log"), TRACE).unwrap();
+    directory
+}
+
+fn cantap(directory: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
+    texts(Command::new(env!("CARGO_BIN_EXE_cantap")).args(arguments).current_dir(directory).output().unwrap())
+}
+
+fn texts(output: Output) -> (Option<i32>, String, String) {
+    let Output { status, stdout, stderr } = output;
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+/// The trace's lines whose numbers are given.
+fn lines(numbers: &[usize]) -> String {
+    numbers.iter().map(|number| TRACE.split_inclusive('\n').nth(*number).unwrap()).collect()
+}
+
+#[test]
+fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compressed() {
+    let directory = directory("there_and_back");
+    for format in ["asc", "blf", "pcapng", "trc", "log"] {
+        for compression in ["", ".gz", ".zst"] {
+            let name = format!("there.{format}{compression}");
+            let (code, out, err) = cantap(&directory, &["convert", "trace.log", &name]);
+            assert_eq!((code, out.as_str(), err.as_str()), (Some(0), "", ""), "{name}");
+            let (code, out, err) = cantap(&directory, &["convert", &name, "-"]);
+            assert_eq!((code, out.as_str(), err.as_str()), (Some(0), TRACE, ""), "{name}");
+        }
+    }
+}
+
+#[test]
+fn a_compressed_file_is_compressed_and_its_format_is_known_without_a_name() {
+    let directory = directory("unnamed");
+    cantap(&directory, &["convert", "trace.log", "a.blf.gz"]);
+    let bytes = fs::read(directory.join("a.blf.gz")).unwrap();
+    assert_eq!(bytes[..2], [0x1F, 0x8B]);
+    fs::rename(directory.join("a.blf.gz"), directory.join("unnamed")).unwrap();
+    let (code, out, _) = cantap(&directory, &["convert", "unnamed", "-"]);
+    assert_eq!((code, out.as_str()), (Some(0), TRACE));
+}
+
+#[test]
+fn what_a_format_does_not_carry_is_counted() {
+    let directory = directory("left_out");
+    let (code, _, err) = cantap(&directory, &["convert", "trace.log", "a.csv"]);
+    assert_eq!(code, Some(0));
+    assert_eq!(
+        err,
+        "cantap: a.csv does not carry channels other than 1, which python-can's CSV has no column for (2)\n\
+         cantap: a.csv does not carry the direction of sent frames, which python-can's CSV has no column for (1)\n"
+    );
+    let (_, out, err) = cantap(&directory, &["convert", "trace.log", "b.csv", "--json"]);
+    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((summary["records"].as_u64(), summary["issues"].as_u64()), (Some(5), Some(0)));
+    assert_eq!(summary["left_out"].as_object().unwrap().len(), 2, "{err}");
+}
+
+#[test]
+fn filters_channels_and_times_pick_records() {
+    let directory = directory("picked");
+    let cases: [(&[&str], &[usize]); 8] = [
+        (&["123:7FF"], &[0]),
+        (&["--filter", "can0,123:7FF", "--filter", "can1,400:7FF"], &[0, 4]),
+        (&["--channel", "2"], &[1, 4]),
+        (&["--start", "1", "--end", "2s"], &[1]),
+        (&["--start", "2014-09-14T17:14:45"], &[3, 4]),
+        (&["--end", "1410714883.5"], &[0, 1]),
+        (&["--channel", "1", "--start", "2"], &[2, 3]),
+        (&["--start", "100"], &[]),
+    ];
+    for (arguments, expected) in cases {
+        let (code, out, err) = cantap(&directory, &[&["convert", "trace.log", "-"], arguments].concat());
+        assert_eq!((code, out, err.as_str()), (Some(0), lines(expected), ""), "{arguments:?}");
+    }
+}
+
+#[test]
+fn a_broken_line_is_told_and_left_out_and_strict_stops_there() {
+    let directory = directory("broken");
+    fs::write(directory.join("broken.log"), lines(&[0, 1]) + "nonsense\n" + &lines(&[2, 3, 4])).unwrap();
+    let (code, out, err) = cantap(&directory, &["convert", "broken.log", "-"]);
+    assert_eq!((code, out.as_str()), (Some(0), TRACE));
+    assert!(err.starts_with("cantap: broken.log, line 3: expected a log line such as '"), "{err}");
+    assert!(err.contains("found 'nonsense'"), "{err}");
+    let (code, out, err) = cantap(&directory, &["convert", "broken.log", "-", "--strict"]);
+    assert_eq!((code, out), (Some(1), lines(&[0, 1])));
+    assert!(err.contains("line 3"), "{err}");
+}
+
+#[test]
+fn rotation_makes_files_that_each_stand_alone_and_keeps_the_last() {
+    let directory = directory("rotated");
+    let arguments = ["convert", "trace.log", "part.asc.gz", "--rotate", "2s", "--keep", "2"];
+    assert_eq!(cantap(&directory, &arguments).0, Some(0));
+    let mut names: Vec<_> = fs::read_dir(&directory)
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().into_string().unwrap())
+        .filter(|name| name.starts_with("part"))
+        .collect();
+    names.sort();
+    assert_eq!(names, ["part-000002.asc.gz", "part-000003.asc.gz"]);
+    for (name, expected) in names.iter().zip([&[2, 3][..], &[4]]) {
+        let (code, out, err) = cantap(&directory, &["convert", name, "-"]);
+        assert_eq!((code, out, err.as_str()), (Some(0), lines(expected), ""), "{name}");
+    }
+}
+
+#[test]
+fn standard_input_and_output_are_logs_unless_told() {
+    let directory = directory("piped");
+    let mut child = Command::new(env!("CARGO_BIN_EXE_cantap"))
+        .args(["convert", "-", "-", "--format", "csv-full"])
+        .current_dir(&directory)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    child.stdin.take().unwrap().write_all(TRACE.as_bytes()).unwrap();
+    let (code, out, err) = texts(child.wait_with_output().unwrap());
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(
+        out.lines().take(3).collect::<Vec<_>>(),
+        [
+            "time,channel,direction,type,id,dlc,data,event",
+            "1410714882.000000,1,Rx,data,123,2,1122,",
+            "1410714883.000000,2,Tx,data,1F334455,1,AA,",
+        ]
+    );
+}
+
+#[test]
+fn the_input_is_never_overwritten_and_unknown_names_are_refused() {
+    let directory = directory("refused");
+    let (code, _, err) = cantap(&directory, &["convert", "trace.log", "./trace.log"]);
+    assert!(code == Some(1) && err.contains("both input and output"), "{code:?} {err}");
+    assert_eq!(fs::read_to_string(directory.join("trace.log")).unwrap(), TRACE);
+    let (code, _, err) = cantap(&directory, &["convert", "trace.log", "a.xyz"]);
+    assert!(code == Some(1) && err.contains("--format"), "{code:?} {err}");
+    assert!(!directory.join("a.xyz").exists());
+    let (code, _, err) = cantap(&directory, &["convert", "absent.log", "a.asc"]);
+    assert!(code == Some(1) && err.contains("absent.log"), "{code:?} {err}");
+    assert!(!directory.join("a.asc").exists(), "an output without an input");
+    let (code, ..) = cantap(&directory, &["convert", "trace.log", "a.asc", "--rotate", "0M"]);
+    assert_eq!(code, Some(2));
+}

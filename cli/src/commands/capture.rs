@@ -8,11 +8,12 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use cantap::device::Records;
 use cantap::filter::Filter;
-use cantap::formats::{Format, TraceWriter, WriteOptions, create_writer};
+use cantap::formats::{Format, TraceWriter, create_writer};
 use cantap::trigger::{Trigger, TriggerCounts};
 use cantap::wire::message::Mode;
 use cantap::{Address, Channel, Device, TraceRecord};
 
+use super::convert::WriteArgs;
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::interrupt;
@@ -57,6 +58,8 @@ pub struct Args {
     json: bool,
     #[command(flatten)]
     trigger: TriggerArgs,
+    #[command(flatten)]
+    write: WriteArgs,
 }
 
 /// How long records may stay in memory while others follow slowly.
@@ -263,7 +266,7 @@ impl Sink {
             None => Path::new("-"),
         };
         let format = path.extension().is_none().then_some(Format::Candump);
-        let options = WriteOptions { format, ..WriteOptions::default() };
+        let options = args.write.options(format)?;
         let name = path.display().to_string();
         let writer = create_writer(path, &options).with_context(|| {
             format!("cannot write to '{name}'; choose a folder and name that you may write")

@@ -103,6 +103,11 @@ impl TriggerSummary {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    // Only a board can have a bit rate saved.
+    if matches!(args.device, Address::Virtual(_)) && args.open.timing.request()?.is_none() {
+        let message = "give the bus's bit rate with -b, such as -b 500k\n";
+        clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
+    }
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     let mut sink = Sink::create(args)?;

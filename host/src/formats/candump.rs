@@ -63,6 +63,9 @@ impl Decoder {
         let us = text::digits(&[*u0, *u1, *u2, *u3, *u4, *u5])?;
         let time_ns = seconds_ns.checked_add(us * 1000)?;
         let (interface, rest) = split_at_byte(rest, b' ')?;
+        if interface.is_empty() {
+            return None;
+        }
         let (id, rest) = match rest {
             _ if rest.get(8) == Some(&b'#') => (&rest[..8], &rest[9..]),
             _ if rest.get(3) == Some(&b'#') => (&rest[..3], &rest[4..]),

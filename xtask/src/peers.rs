@@ -11,7 +11,7 @@ use crate::workspace;
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
 /// Python packages, each named as pip and as `import` want it.
-const MODULES: [(&str, &str); 2] = [("python-can", "can"), ("cantools", "cantools")];
+const MODULES: [(&str, &str); 3] = [("python-can", "can"), ("pyserial", "serial"), ("cantools", "cantools")];
 
 /// Where the peers are.
 pub struct Peers {

@@ -85,7 +85,7 @@ impl ChannelArgs {
     /// The configuration that was asked for; where no bit timing was, the one saved on the device.
     fn config(&self, device: &Device, channel: Channel, mode: Mode) -> anyhow::Result<ChannelConfig> {
         let is_virtual = matches!(device.name().parse(), Ok(Address::Virtual(_)));
-        let request = match self.timing.request()? {
+        let request = match self.timing.request(channel)? {
             None if is_virtual => Some(TimingRequest::Rate {
                 bitrate_bps: VIRTUAL_BITRATE_BPS,
                 sample_point_percent: None,

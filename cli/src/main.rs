@@ -2,6 +2,7 @@
 
 mod args;
 mod channel_args;
+mod channel_bitrate;
 mod commands;
 mod databases;
 mod input;

@@ -1,26 +1,27 @@
 //! How a user gives a bit timing; the same options in every command that opens a channel.
 
 use anyhow::bail;
+use cantap::Channel;
 use cantap::bit_timing::{self, TimingError, TimingRequest};
 use cantap::wire::BitTiming;
 
-use crate::args;
+use crate::channel_bitrate::ChannelBitrate;
 
 /// A bit timing on the command line; for commands to flatten into theirs.
 #[derive(clap::Args, Clone)]
 pub struct TimingArgs {
-    /// Bit rate in bit/s: 500000, 500k, 1M.
-    #[arg(short, long, value_name = "RATE", value_parser = args::bitrate)]
-    pub bitrate: Option<u32>,
+    /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    pub bitrates: Vec<ChannelBitrate>,
     #[command(flatten)]
     wishes: Wishes,
     /// The whole timing, in quanta: prescaler, PROP+PS1, PS2, jump width.
     #[arg(long, value_name = "BRP,SEG1,SEG2,SJW", value_parser = bit_timing::parse_segments,
-          conflicts_with_all = ["bitrate", "sample_point", "sjw", "btr"])]
+          conflicts_with_all = ["bitrates", "sample_point", "sjw", "btr"])]
     segments: Option<BitTiming>,
     /// The whole timing, as bxCAN's register CAN_BTR: 0x001C0008.
     #[arg(long, value_name = "REGISTER", value_parser = register,
-          conflicts_with_all = ["bitrate", "sample_point", "sjw"])]
+          conflicts_with_all = ["bitrates", "sample_point", "sjw"])]
     btr: Option<BitTiming>,
 }
 
@@ -46,14 +47,14 @@ impl Wishes {
 }
 
 impl TimingArgs {
-    /// What was asked for, if anything was.
-    pub fn request(&self) -> anyhow::Result<Option<TimingRequest>> {
+    /// What was asked for on a channel, if anything was.
+    pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
         if let Some(timing) = self.segments.or(self.btr) {
             return Ok(Some(TimingRequest::Exact(timing)));
         }
         let Wishes { sample_point, sjw, .. } = self.wishes;
-        match self.bitrate {
+        match ChannelBitrate::of(&self.bitrates, channel.number()) {
             Some(bitrate_bps) => {
                 Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
             }
@@ -96,7 +97,7 @@ mod tests {
     fn timing(line: &str) -> Result<Option<BitTiming>, String> {
         let line = Line::try_parse_from(std::iter::once("x").chain(line.split_whitespace()))
             .map_err(|error| error.to_string())?;
-        let request = line.timing.request().map_err(|error| error.to_string())?;
+        let request = line.timing.request(Channel::Can1).map_err(|error| error.to_string())?;
         request.map(|request| request.resolve(36_000_000)).transpose().map_err(|error| error.to_string())
     }
 
@@ -109,6 +110,19 @@ mod tests {
         let narrow = BitTiming { jump_width: 1, ..expected };
         assert_eq!(timing("-b 250000 --sample-point 87.5 --sjw 1"), Ok(Some(narrow)));
         assert_eq!(timing(""), Ok(None));
+    }
+
+    #[test]
+    fn a_channel_may_have_a_bit_rate_of_its_own() {
+        let line = Line::try_parse_from("x -b 500k -b 2:250k -b 1M".split(' ')).unwrap();
+        let rate = |channel| match line.timing.request(channel).unwrap() {
+            Some(TimingRequest::Rate { bitrate_bps, .. }) => bitrate_bps,
+            other => panic!("{other:?}"),
+        };
+        // As with any option that is given twice, the last one counts.
+        assert_eq!((rate(Channel::Can1), rate(Channel::Can2)), (1_000_000, 250_000));
+        let line = Line::try_parse_from("x -b 2:250k".split(' ')).unwrap();
+        assert_eq!(line.timing.request(Channel::Can1).unwrap(), None);
     }
 
     #[test]

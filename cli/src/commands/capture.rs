@@ -101,11 +101,21 @@ impl TriggerSummary {
     }
 }
 
+/// Whether a channel to open has no bit rate.
+fn needs_bit_rate(args: &Args) -> anyhow::Result<bool> {
+    for channel in args.channel.iter() {
+        if args.open.timing.request(channel)?.is_none() {
+            return Ok(true);
+        }
+    }
+    Ok(false)
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Only a board can have a bit rate saved.
-    if matches!(args.device, Address::Virtual(_)) && args.open.timing.request()?.is_none() {
-        let message = "give the bus's bit rate with -b, such as -b 500k\n";
+    if matches!(args.device, Address::Virtual(_)) && needs_bit_rate(args)? {
+        let message = "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
     interrupt::watch()?;

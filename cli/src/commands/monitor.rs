@@ -11,8 +11,8 @@ use cantap::filter::Filter;
 use cantap::signals::Decoder;
 use cantap::wire::message::Mode;
 
-use super::stats::ChannelBitrate;
 use crate::args;
+use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::DatabaseArgs;
 use crate::monitor::app::{App, View, channels_of};
 use crate::monitor::model::Model;

@@ -13,8 +13,8 @@ use cantap::plot::{
 };
 use cantap::stats::Options;
 
-use super::stats::ChannelBitrate;
 use crate::args;
+use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::DatabaseArgs;
 use crate::input::{ReadArgs, Records};
 

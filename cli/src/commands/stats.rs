@@ -6,7 +6,6 @@ mod table;
 use std::io::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::str::FromStr;
 use std::time::Duration;
 
 use anyhow::bail;
@@ -14,6 +13,7 @@ use cantap::Address;
 use cantap::stats::{Options, PeakSummary, Statistics, Summary};
 
 use crate::args;
+use crate::channel_bitrate::ChannelBitrate;
 use crate::input::ReadArgs;
 
 /// The command line.
@@ -56,42 +56,6 @@ pub struct Args {
     json: bool,
     #[command(flatten)]
     read: ReadArgs,
-}
-
-/// A bit rate, of one channel or of all that have none of their own.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct ChannelBitrate {
-    /// From 1.
-    pub channel: Option<u8>,
-    /// In bit/s.
-    pub bitrate_bps: u32,
-}
-
-impl FromStr for ChannelBitrate {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, Self::Err> {
-        let Some((channel, bitrate)) = text.split_once(':') else {
-            return Ok(Self { channel: None, bitrate_bps: args::bitrate(text)? });
-        };
-        match channel.parse() {
-            Ok(channel @ 1..) => Ok(Self { channel: Some(channel), bitrate_bps: args::bitrate(bitrate)? }),
-            _ => Err("write it as BITRATE or CHANNEL:BITRATE, such as 500k or 2:250k".to_owned()),
-        }
-    }
-}
-
-impl ChannelBitrate {
-    /// The library's options with these bit rates.
-    pub fn options(rates: &[Self]) -> Options {
-        let own = rates.iter().filter_map(|rate| Some((rate.channel?, rate.bitrate_bps)));
-        let common = rates.iter().rev().find(|rate| rate.channel.is_none());
-        Options {
-            bitrate_bps: common.map(|rate| rate.bitrate_bps),
-            channel_bitrate_bps: own.collect(),
-            ..Options::default()
-        }
-    }
 }
 
 impl Args {
@@ -141,19 +105,4 @@ fn print_json(summary: &Summary, windows: Option<&Vec<PeakSummary>>) -> anyhow::
 /// To standard output, whose reader may have gone.
 fn print(text: &str) -> anyhow::Result<()> {
     Ok(std::io::stdout().lock().write_all(text.as_bytes())?)
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_bit_rate_may_name_its_channel() {
-        let parse = |text: &str| text.parse::<ChannelBitrate>().map(|rate| (rate.channel, rate.bitrate_bps));
-        assert_eq!(parse("500k"), Ok((None, 500_000)));
-        assert_eq!(parse("2:83.333k"), Ok((Some(2), 83_333)));
-        for wrong in ["0:500k", "2:", "x:500k", "300:1M", "2:fast"] {
-            assert!(parse(wrong).is_err(), "{wrong}");
-        }
-    }
 }

@@ -452,7 +452,7 @@ impl App {
         };
         let rates = text
             .split_whitespace()
-            .map(str::parse::<crate::commands::stats::ChannelBitrate>)
+            .map(str::parse::<crate::channel_bitrate::ChannelBitrate>)
             .collect::<Result<Vec<_>, _>>()?;
         let plan = Plan { channels: channels_of(&rates)?, ..plan.clone() };
         self.open(plan, model)
@@ -515,8 +515,8 @@ impl App {
 }
 
 /// Channels to open from bit rates: one without a channel is for both.
-pub fn channels_of(rates: &[crate::commands::stats::ChannelBitrate]) -> Result<Vec<(Channel, u32)>, String> {
-    let options = crate::commands::stats::ChannelBitrate::options(rates);
+pub fn channels_of(rates: &[crate::channel_bitrate::ChannelBitrate]) -> Result<Vec<(Channel, u32)>, String> {
+    let options = crate::channel_bitrate::ChannelBitrate::options(rates);
     let channels: Vec<_> = Channel::ALL
         .into_iter()
         .filter_map(|channel| Some((channel, options.bitrate_of(channel.number())?)))

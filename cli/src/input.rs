@@ -7,6 +7,7 @@ use cantap::TraceRecord;
 use cantap::filter::Filter;
 use cantap::formats::{Format, ReadOptions, TraceReader, open_reader};
 
+use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
 
 /// How to read a trace; for commands to flatten into theirs.
@@ -34,6 +35,9 @@ pub struct Records {
     source: Source,
     filters: Vec<Filter>,
     strict: bool,
+    /// What [`Self::next`] takes from; the records before `at` are used up.
+    batch: Vec<TraceRecord>,
+    at: usize,
 }
 
 enum Source {
@@ -46,7 +50,11 @@ impl ReadArgs {
     /// Opens the file, or standard input for `-`.
     pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
         let options = ReadOptions { format: self.format, follow: self.follow, strict: self.strict };
-        let reader = open_reader(path, &options)?;
+        let mut reader = open_reader(path, &options)?;
+        if self.follow {
+            interrupt::watch()?;
+            reader.end_when(interrupt::requested);
+        }
         let grows = self.follow || path.as_os_str() == "-";
         Ok(self.records(Source::File(reader, grows)))
     }
@@ -61,17 +69,19 @@ impl ReadArgs {
     }
 
     fn records(&self, source: Source) -> Records {
-        Records { source, filters: self.filter.clone(), strict: self.strict }
+        let filters = self.filter.clone();
+        Records { source, filters, strict: self.strict, batch: Vec::new(), at: 0 }
     }
 }
 
 impl Records {
     /// Whether the next record may take a while, so that results should not wait in a buffer.
     pub fn may_wait(&self) -> bool {
-        match &self.source {
-            Source::File(reader, grows) => *grows && reader.would_wait(),
-            Source::Device(live) => !live.has_next(),
-        }
+        self.at == self.batch.len()
+            && match &self.source {
+                Source::File(reader, grows) => *grows && reader.would_wait(),
+                Source::Device(_) => true,
+            }
     }
 
     /// Ends a file that grows as soon as this is true; says whether it is one.
@@ -93,27 +103,44 @@ impl Records {
         }
     }
 
-    /// The next record that passes the filters; `None` at the end. With `--strict`, an issue is an error.
-    pub fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
-        loop {
-            let record = match &mut self.source {
-                Source::File(reader, _) => next_of_file(reader, self.strict)?,
-                Source::Device(live) => live.next()?,
-            };
-            let Some(record) = record else { return Ok(None) };
-            if self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(&record)) {
-                return Ok(Some(record));
-            }
+    /// Puts the next records that pass the filters in the place of what is in `records`, which may be none; false at the
+    /// end. With `--strict`, an issue is an error.
+    pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
+        let more = match &mut self.source {
+            Source::File(reader, _) => batch_of_file(reader, self.strict, records)?,
+            Source::Device(live) => live.next_batch(records)?,
+        };
+        if !self.filters.is_empty() {
+            records.retain(|record| self.filters.iter().any(|filter| filter.accepts(record)));
         }
+        Ok(more)
+    }
+
+    /// The next record, as [`Self::next_batch`].
+    pub fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
+        while self.at == self.batch.len() {
+            let mut batch = std::mem::take(&mut self.batch);
+            self.at = 0;
+            if !self.next_batch(&mut batch)? {
+                return Ok(None);
+            }
+            self.batch = batch;
+        }
+        self.at += 1;
+        Ok(self.batch.get(self.at - 1).copied())
     }
 }
 
-/// The next record; says what is wrong on the way, and at the end how often that was.
-fn next_of_file(reader: &mut TraceReader, strict: bool) -> anyhow::Result<Option<TraceRecord>> {
+/// The next records; says what is wrong on the way, and at the end how often that was.
+fn batch_of_file(
+    reader: &mut TraceReader,
+    strict: bool,
+    records: &mut Vec<TraceRecord>,
+) -> anyhow::Result<bool> {
     loop {
-        match reader.next() {
+        match reader.next_batch(records) {
             None => break,
-            Some(Ok(record)) => return Ok(Some(record)),
+            Some(Ok(())) => return Ok(true),
             Some(Err(issue)) if strict => bail!(issue),
             Some(Err(issue)) if reader.issues() <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
             Some(Err(_)) => {}
@@ -124,5 +151,5 @@ fn next_of_file(reader: &mut TraceReader, strict: bool) -> anyhow::Result<Option
         1 => eprintln!("cantap: 1 place in the file could not be read and was left out"),
         issues => eprintln!("cantap: {issues} places in the file could not be read and were left out"),
     }
-    Ok(None)
+    Ok(false)
 }

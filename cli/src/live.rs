@@ -33,7 +33,6 @@ const LOOK_EVERY: Duration = Duration::from_millis(50);
 pub struct LiveRecords {
     device: Device,
     records: cantap::device::Records,
-    batch: std::vec::IntoIter<TraceRecord>,
     ends: Option<Instant>,
     stopped: bool,
 }
@@ -50,33 +49,23 @@ impl LiveArgs {
             device.listen(channel, bitrate).with_context(|| format!("channel {}", channel.number()))?;
         }
         let ends = self.time.map(|time| Instant::now() + time);
-        Ok(Some(LiveRecords { device, records, batch: Vec::new().into_iter(), ends, stopped: false }))
+        Ok(Some(LiveRecords { device, records, ends, stopped: false }))
     }
 }
 
 impl LiveRecords {
-    /// Whether the next record has arrived already.
-    pub fn has_next(&self) -> bool {
-        self.batch.len() > 0
-    }
-
-    /// The next record; `None` after Ctrl-C or the end of the time, when everything that was captured has
-    /// been handed out.
-    pub fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
-        loop {
-            if let Some(record) = self.batch.next() {
-                return Ok(Some(record));
-            }
-            if !self.stopped
-                && (interrupt::requested() || self.ends.is_some_and(|ends| Instant::now() >= ends))
-            {
-                self.device.stop()?;
-                self.stopped = true;
-            }
-            match self.records.next_batch(LOOK_EVERY)? {
-                Some(batch) => self.batch = batch.into_iter(),
-                None => return Ok(None),
-            }
+    /// Puts the next records, or none after a while without any, in the place of what is in `records`; false after Ctrl-C
+    /// or the end of the time, when everything that was captured has been handed out.
+    pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
+        if !self.stopped && (interrupt::requested() || self.ends.is_some_and(|ends| Instant::now() >= ends)) {
+            self.device.stop()?;
+            self.stopped = true;
         }
+        let Some(batch) = self.records.next_batch(LOOK_EVERY)? else {
+            records.clear();
+            return Ok(false);
+        };
+        self.records.recycle(std::mem::replace(records, batch));
+        Ok(true)
     }
 }

@@ -85,6 +85,7 @@ impl Frame {
     /// A frame as a controller reports it. `dlc` is the four-bit field of the bus (0 to 15, its
     /// low four bits are kept; above 8 it still means eight bytes). Bytes of `data` beyond the
     /// length are ignored, as is all of it in a remote frame.
+    #[inline]
     pub fn from_bus(id: Id, remote: bool, dlc: u8, data: [u8; 8]) -> Self {
         let dlc = dlc & 15;
         let mut kept = [0; 8];

@@ -140,22 +140,24 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut writer = create_writer(&args.output, &options).with_context(failed)?;
     let mut window = Window::new(args.start, args.end);
     let mut written = 0_u64;
+    let mut batch = Vec::new();
     // What came until an error is kept: the file is finished all the same.
     let read = loop {
-        match records.next() {
-            Ok(Some(record)) => {
-                // The window's first record is the trace's, whatever the channel.
-                let inside = window.contains(&record);
-                if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
-                    writer.write(&record).with_context(failed)?;
-                    written += 1;
-                }
-                if records.may_wait() {
-                    writer.flush().with_context(failed)?;
-                }
-            }
-            Ok(None) => break Ok(()),
+        match records.next_batch(&mut batch) {
+            Ok(true) => {}
+            Ok(false) => break Ok(()),
             Err(error) => break Err(error),
+        }
+        for record in &batch {
+            // The window's first record is the trace's, whatever the channel.
+            let inside = window.contains(record);
+            if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
+                writer.write(record).with_context(failed)?;
+                written += 1;
+            }
+        }
+        if records.may_wait() {
+            writer.flush().with_context(failed)?;
         }
     };
     let left_out = writer.finish().with_context(failed)?;

@@ -89,25 +89,27 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
     if args.csv {
         csv::write_header(out)?;
     }
-    while let Some(record) = records.next()? {
-        if let TraceEvent::Lost { count: lost, .. } = record.event {
-            count.lost += u64::from(lost);
-        }
-        let Some(frame) = record.frame() else { continue };
-        count.frames += 1;
-        let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
-        // Chosen signals only: a message without any of them is not worth a line.
-        if values.is_empty() && !args.signals.is_empty() {
-            continue;
-        }
-        count.decoded += 1;
-        count.signals += values.len() as u64;
-        let decoded =
-            Decoded { record: &record, frame, message: decoder.message(reference), values: &values };
-        match (args.json, args.csv) {
-            (true, _) => json::write(out, &decoded)?,
-            (_, true) => csv::write(out, &decoded)?,
-            _ => text::write(out, &decoded)?,
+    let mut batch = Vec::new();
+    while records.next_batch(&mut batch)? {
+        for record in &batch {
+            if let TraceEvent::Lost { count: lost, .. } = record.event {
+                count.lost += u64::from(lost);
+            }
+            let Some(frame) = record.frame() else { continue };
+            count.frames += 1;
+            let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
+            // Chosen signals only: a message without any of them is not worth a line.
+            if values.is_empty() && !args.signals.is_empty() {
+                continue;
+            }
+            count.decoded += 1;
+            count.signals += values.len() as u64;
+            let decoded = Decoded { record, frame, message: decoder.message(reference), values: &values };
+            match (args.json, args.csv) {
+                (true, _) => json::write(out, &decoded)?,
+                (_, true) => csv::write(out, &decoded)?,
+                _ => text::write(out, &decoded)?,
+            }
         }
         if records.may_wait() {
             out.flush()?;

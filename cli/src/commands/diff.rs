@@ -63,8 +63,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 fn profile(args: &Args, path: &Path) -> anyhow::Result<Profile> {
     let mut profile = if args.ignore_channels { Profile::ignoring_channels() } else { Profile::default() };
     let mut records = args.read.open(path)?;
-    while let Some(record) = records.next()? {
-        profile.add(&record);
+    let mut batch = Vec::new();
+    while records.next_batch(&mut batch)? {
+        for record in &batch {
+            profile.add(record);
+        }
     }
     Ok(profile)
 }

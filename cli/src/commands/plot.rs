@@ -110,8 +110,9 @@ fn collect(args: &Args) -> anyhow::Result<Plot> {
 }
 
 fn for_each(mut records: Records, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<()> {
-    while let Some(record) = records.next()? {
-        take(&record);
+    let mut batch = Vec::new();
+    while records.next_batch(&mut batch)? {
+        batch.iter().for_each(&mut take);
     }
     Ok(())
 }

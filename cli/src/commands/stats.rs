@@ -78,8 +78,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 windows.push(PeakSummary::of(window));
             }
         };
-        while let Some(record) = records.next()? {
-            statistics.push_with(&record, &mut closed);
+        let mut batch = Vec::new();
+        while records.next_batch(&mut batch)? {
+            for record in &batch {
+                statistics.push_with(record, &mut closed);
+            }
         }
         statistics.finish_with(&mut closed);
     } else {

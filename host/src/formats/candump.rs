@@ -9,7 +9,8 @@ use cantap_wire::{Frame, Id};
 use super::input::Input;
 use super::interfaces::{self, Interfaces};
 use super::issue::Fault;
-use super::reader::{Decode, Found};
+use super::line::{Line, Seconds};
+use super::reader::{BATCH, Decode, Found};
 use super::text::{self, NS_PER_S};
 use super::writer::{Encode, LeftOut};
 use crate::socketcan::{BUS_ERROR, ERROR_FLAG, ErrorFrame};
@@ -23,6 +24,9 @@ pub(crate) struct Decoder {
     interfaces: Interfaces,
     /// A second event of the last line.
     pending: Option<TraceRecord>,
+    /// The last second's digits and time: most lines are in the same second as the one before.
+    second: [u8; 10],
+    second_ns: i64,
 }
 
 impl Decode for Decoder {
@@ -35,9 +39,6 @@ impl Decode for Decoder {
             if matches!(text.first(), None | Some(b'#')) && !line.too_long {
                 continue;
             }
-            if let Some(record) = self.plain(text) {
-                return Ok(Found::Record(record));
-            }
             return Ok(match self.parse(text) {
                 Ok((record, second)) => {
                     self.pending = second.map(|event| TraceRecord { event, ..record });
@@ -48,44 +49,78 @@ impl Decode for Decoder {
         }
         Ok(Found::End)
     }
+
+    /// Lines exactly as candump writes them are read where they are in the buffer; the others one by one.
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            if self.pending.is_none() {
+                let (mut used, mut lines) = (0, 0);
+                let buffered = input.buffered();
+                while records.len() < BATCH
+                    && let Some((record, len)) = self.plain(&buffered[used..])
+                {
+                    records.push(record);
+                    used += len;
+                    lines += 1;
+                }
+                input.consume_lines(used, lines);
+            }
+            if records.len() >= BATCH || !records.is_empty() && input.may_wait() && !input.has_line() {
+                return Ok(None);
+            }
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+        }
+    }
 }
 
 impl Decoder {
-    /// A data frame exactly as candump writes it, with ten digits of seconds, as most lines are: everything at its place, so
-    /// nothing is searched for. `None` is no verdict: [`Self::parse`] looks at the line then.
+    /// The line that `text` begins with, if it is a data frame exactly as candump writes it, with ten digits of seconds,
+    /// as most lines are, and its length with its end. Everything is at its place, so nothing is searched for. `None` is
+    /// no verdict: [`Self::parse`] looks at the line then.
     #[inline]
-    fn plain(&mut self, line: &[u8]) -> Option<TraceRecord> {
-        let (time, rest) = line.split_first_chunk::<20>()?;
+    fn plain(&mut self, text: &[u8]) -> Option<(TraceRecord, usize)> {
+        let (time, rest) = text.split_first_chunk::<20>()?;
         let [b'(', seconds @ .., b'.', u0, u1, u2, u3, u4, u5, b')', b' '] = time else { return None };
-        let seconds = text::digits(seconds.first_chunk::<10>()?)?;
-        // Ten digits reach beyond the year 2262, where nanoseconds no longer fit.
-        let seconds_ns = seconds.checked_mul(NS_PER_S)?;
+        let seconds: &[u8; 10] = seconds.first_chunk()?;
+        if *seconds != self.second {
+            // Ten digits reach beyond the year 2262, where nanoseconds no longer fit.
+            self.second_ns = text::digits(seconds)?.checked_mul(NS_PER_S)?;
+            self.second = *seconds;
+        }
         let us = text::digits(&[*u0, *u1, *u2, *u3, *u4, *u5])?;
-        let time_ns = seconds_ns.checked_add(us * 1000)?;
+        let time_ns = self.second_ns.checked_add(us * 1000)?;
         let (interface, rest) = split_at_byte(rest, b' ')?;
         if interface.is_empty() {
             return None;
         }
         let (id, rest) = match rest {
-            _ if rest.get(8) == Some(&b'#') => (&rest[..8], &rest[9..]),
-            _ if rest.get(3) == Some(&b'#') => (&rest[..3], &rest[4..]),
+            [a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
+                (Id::extended(text::hex(&[*a, *b, *c, *d, *e, *f, *g, *h])?)?, rest)
+            }
+            [a, b, c, b'#', rest @ ..] => (Id::standard(text::hex(&[*a, *b, *c])?)?, rest),
             _ => return None,
         };
-        let raw = text::hex(id)?;
-        let id = if id.len() == 8 { Id::extended(raw) } else { Id::standard(raw) }?;
-        let (digits, direction) = match rest {
-            [digits @ .., b' ', b'T'] => (digits, Direction::Tx),
-            [digits @ .., b' ', b'R'] | digits => (digits, Direction::Rx),
+        let (data, len, rest) = match rest.split_first_chunk::<16>() {
+            Some((digits, rest)) if let Some(data) = text::eight_bytes(digits) => (data, 8, rest),
+            _ => {
+                let digits = rest.iter().take_while(|digit| text::hex_digit(**digit).is_some()).count();
+                let (data, len) = bytes(&rest[..digits])?;
+                (data, len, &rest[digits..])
+            }
         };
-        let (data, len) = match <&[u8; 16]>::try_from(digits) {
-            Ok(digits) => (text::eight_bytes(digits)?, 8),
-            Err(_) => bytes(digits)?,
+        let (direction, rest) = match rest {
+            [b' ', b'T', rest @ ..] => (Direction::Tx, rest),
+            [b' ', b'R', rest @ ..] | rest => (Direction::Rx, rest),
         };
+        let [b'\n', rest @ ..] = rest else { return None };
         // Only now: a line that is refused must not name an interface.
         let channel = self.interfaces.channel(interface);
         let frame = Frame::from_bus(id, false, len, data);
         let event = TraceEvent::Frame { frame, direction, late: false };
-        Some(TraceRecord { time_ns, channel, event })
+        Some((TraceRecord { time_ns, channel, event }, text.len() - rest.len()))
     }
 
     /// One line's record, and a second event if it says two things.
@@ -165,36 +200,49 @@ fn payload(id: Id, digits: &[u8]) -> Result<Frame, Fault> {
 }
 
 /// Writes the format.
-pub(crate) struct Encoder;
+pub(crate) struct Encoder {
+    seconds: Seconds<0>,
+}
+
+impl Default for Encoder {
+    fn default() -> Self {
+        Self { seconds: Seconds::new() }
+    }
+}
 
 impl Encode for Encoder {
     #[inline]
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        out.push(b'(');
-        text::push_time(out, record.time_ns, NS_PER_S, 6, b'.');
-        out.extend_from_slice(b") can");
-        text::push_decimal(out, u64::from(interfaces::number(record.channel)));
-        out.push(b' ');
+        let mut line = Line::new();
+        if record.time_ns >= 0 {
+            line.put(b"(");
+            self.seconds.put(&mut line, record.time_ns as u64 / 1000);
+        } else {
+            out.push(b'(');
+            text::push_time(out, record.time_ns, NS_PER_S, 6, b'.');
+        }
+        line.put(b") can");
+        line.put_small(interfaces::number(record.channel));
+        line.put(b" ");
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
-                push_frame(out, frame);
+                put_frame(&mut line, frame);
                 if *direction == Direction::Tx {
-                    out.extend_from_slice(b" T");
+                    line.put(b" T");
                 }
             }
             event => {
                 // Every event but a frame has an error frame. python-can takes one without this class for
                 // a frame on the bus.
                 if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
-                    text::push_hex(out, ERROR_FLAG | BUS_ERROR | classes, 8);
-                    out.push(b'#');
-                    for byte in data {
-                        text::push_hex_byte(out, byte);
-                    }
+                    line.put(&text::hex_digits_of(ERROR_FLAG | BUS_ERROR | classes));
+                    line.put(b"#");
+                    line.put(&text::hex_digits_of_eight(data));
                 }
             }
         }
-        out.push(b'\n');
+        line.put(b"\n");
+        line.end(out);
     }
 
     fn finish(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
@@ -202,22 +250,25 @@ impl Encode for Encoder {
 
 /// `123#DEADBEEF`.
 #[inline]
-fn push_frame(out: &mut Vec<u8>, frame: &Frame) {
+fn put_frame(line: &mut Line, frame: &Frame) {
     let id = frame.id();
-    text::push_hex(out, id.raw(), if id.is_extended() { 8 } else { 3 });
-    out.push(b'#');
+    let digits = text::hex_digits_of(id.raw());
+    if id.is_extended() {
+        line.put(&digits);
+    } else {
+        line.put(&[digits[5], digits[6], digits[7]]);
+    }
+    line.put(b"#");
     if frame.is_remote() {
-        out.push(b'R');
+        line.put(b"R");
         if frame.dlc() > 0 {
-            out.push(b'0' + frame.dlc().min(8));
+            line.put(&[b'0' + frame.dlc().min(8)]);
         }
     }
-    for byte in frame.data() {
-        text::push_hex_byte(out, *byte);
-    }
+    line.put_start(&text::hex_digits_of_eight(frame.padded_data()), 2 * frame.data_len());
     if frame.dlc() > 8 {
-        out.push(b'_');
-        text::push_hex(out, u32::from(frame.dlc()), 1);
+        line.put(b"_");
+        line.put_hex(u32::from(frame.dlc()));
     }
 }
 
@@ -239,7 +290,8 @@ mod tests {
             line in "\\([0-9]{9,11}[.,][0-9]{5,7}\\) (can0|x|) ?([0-7]?[0-9A-Fa-f]{2}|[012][0-9A-F]{7})#([0-9A-Fa-fR]{2}){0,9}( [RTQ])?",
         ) {
             let (mut short, mut long) = (super::Decoder::default(), super::Decoder::default());
-            if let Some(record) = short.plain(line.as_bytes()) {
+            if let Some((record, len)) = short.plain(format!("{line}\n(").as_bytes()) {
+                prop_assert_eq!(len, line.len() + 1);
                 prop_assert_eq!(long.parse(line.as_bytes()).ok(), Some((record, None)));
             }
         }
@@ -254,8 +306,8 @@ mod tests {
     #[test]
     fn ordinary_lines_go_the_short_way() {
         for frame in ["09F80102#36729A16021AB80D", "123#", "7FF#11 R", "000#0102030405060708 T"] {
-            let line = format!("(1410714882.622188) can0 {frame}");
-            let record = super::Decoder::default().plain(line.as_bytes());
+            let line = format!("(1410714882.622188) can0 {frame}\n");
+            let record = super::Decoder::default().plain(line.as_bytes()).map(|(record, _)| record);
             assert_eq!(record, tests::read(Format::Candump, line.as_str()).0.first().copied(), "{frame}");
             assert!(record.is_some(), "{frame}");
         }

@@ -149,6 +149,10 @@ pub(crate) struct Decoder {
 }
 
 impl Decode for Decoder {
+    fn needs_one_line(&self) -> bool {
+        false
+    }
+
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(record) = self.pending.take() {
             return Ok(Found::Record(record));

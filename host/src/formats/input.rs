@@ -32,6 +32,8 @@ pub(crate) struct Input {
     /// Lines handed out so far.
     lines: u64,
     follow: bool,
+    /// Whether its bytes may come slowly: a pipe, a terminal, a file that is followed.
+    may_wait: bool,
     ended: bool,
     cut: bool,
     stop: Box<dyn Fn() -> bool + Send>,
@@ -72,6 +74,7 @@ impl Input {
             offset: 0,
             lines: 0,
             follow,
+            may_wait: true,
             ended: false,
             cut: false,
             stop: Box::new(|| false),
@@ -80,17 +83,19 @@ impl Input {
 
     /// Opens a file, or standard input for `-`; recognises gzip and zstd by their first bytes.
     pub(crate) fn open(path: &Path, follow: bool) -> io::Result<Self> {
-        let source: Box<dyn Read + Send> = if path.as_os_str() == "-" {
-            Box::new(io::stdin())
-        } else {
-            // Opening a directory succeeds on Unix, and only reading it fails.
-            if path.is_dir() {
-                return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory"));
-            }
-            Box::new(File::open(path)?)
-        };
-        // The end of a pipe is final.
-        Self::decompressing(source, follow && path.as_os_str() != "-")
+        if path.as_os_str() == "-" {
+            // The end of a pipe is final.
+            return Self::decompressing(Box::new(io::stdin()), false);
+        }
+        // Opening a directory succeeds on Unix, and only reading it fails.
+        if path.is_dir() {
+            return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory"));
+        }
+        let file = File::open(path)?;
+        let is_file = file.metadata()?.is_file();
+        let mut input = Self::decompressing(Box::new(file), follow)?;
+        input.may_wait = follow || !is_file;
+        Ok(input)
     }
 
     /// Reads from a source that may be compressed.
@@ -119,9 +124,15 @@ impl Input {
         self.stop = stop;
     }
 
-    /// Whether everything read so far is used up.
-    pub(crate) fn is_used_up(&self) -> bool {
-        self.start == self.end
+    /// Whether its bytes may come slowly.
+    #[inline]
+    pub(crate) fn may_wait(&self) -> bool {
+        self.may_wait
+    }
+
+    /// Whether a whole line has been read and is not used up.
+    pub(crate) fn has_line(&self) -> bool {
+        memchr::memchr(b'\n', &self.buffer[self.start..self.end]).is_some()
     }
 
     /// Whether compressed data ended before its own end mark.
@@ -194,6 +205,18 @@ impl Input {
         let len = len.min(self.end - self.start);
         self.start += len;
         self.offset += len as u64;
+    }
+
+    /// All that is buffered and not used up.
+    #[inline]
+    pub(crate) fn buffered(&self) -> &[u8] {
+        &self.buffer[self.start..self.end]
+    }
+
+    /// Uses up so many lines that [`Self::buffered`] showed, `len` bytes in all.
+    pub(crate) fn consume_lines(&mut self, len: usize, lines: u64) {
+        self.consume(len);
+        self.lines += lines;
     }
 
     /// The next line; `None` at the end.

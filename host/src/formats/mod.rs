@@ -18,6 +18,7 @@ mod format;
 mod input;
 mod interfaces;
 mod issue;
+mod line;
 mod output;
 mod pcapng;
 mod reader;

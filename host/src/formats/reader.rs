@@ -45,7 +45,29 @@ pub(crate) enum Found {
 pub(crate) trait Decode: Send {
     /// The next record or issue. Errors are those of the system.
     fn next(&mut self, input: &mut Input) -> io::Result<Found>;
+
+    /// Whether a line that is there is enough for [`Self::next`] not to wait for more.
+    fn needs_one_line(&self) -> bool {
+        true
+    }
+
+    /// Records up to something else, which is returned; `None` if there are enough, or if more must be waited for. Here,
+    /// so that each format's [`Self::next`] becomes part of its own loop.
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+            if records.len() >= BATCH || input.may_wait() && !(self.needs_one_line() && input.has_line()) {
+                return Ok(None);
+            }
+        }
+    }
 }
+
+/// Records decoded at a time: few enough to stay in the processor's cache.
+pub(crate) const BATCH: usize = 256;
 
 /// A trace being read: an iterator of records and issues in the file's order. Memory does not grow with
 /// the file.
@@ -54,9 +76,21 @@ pub struct TraceReader {
     format: Format,
     input: Input,
     decoder: Box<dyn Decode>,
+    /// Records decoded; those before `at` are used up.
+    batch: Vec<TraceRecord>,
+    at: usize,
+    /// What follows them.
+    after: Option<io::Result<Found>>,
     strict: bool,
     issues: u64,
     ended: bool,
+}
+
+/// What comes behind a batch of records.
+enum Beyond {
+    Batch,
+    Issue(ReadIssue),
+    End,
 }
 
 /// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes
@@ -94,7 +128,8 @@ impl TraceReader {
             Format::Pcapng => Box::new(pcapng::Decoder::default()),
             Format::Dif => Box::new(dif::Decoder::default()),
         };
-        Self { name, format, input, decoder, strict, issues: 0, ended: false }
+        let batch = Vec::with_capacity(BATCH);
+        Self { name, format, input, decoder, batch, at: 0, after: None, strict, issues: 0, ended: false }
     }
 
     /// Reads from any source of bytes, plain or compressed. `name` is what issues call it.
@@ -120,7 +155,9 @@ impl TraceReader {
 
     /// Whether the next record may have to be waited for: what was read before is used up.
     pub fn would_wait(&self) -> bool {
-        self.input.is_used_up()
+        self.at == self.batch.len()
+            && self.after.is_none()
+            && !(self.decoder.needs_one_line() && self.input.has_line())
     }
 
     /// How many issues have come so far.
@@ -133,6 +170,58 @@ impl TraceReader {
         self.ended |= self.strict || matches!(fault, Fault::Io(_));
         ReadIssue { file: self.name.clone(), place, fault }
     }
+
+    /// What comes when the batch is used up. A new batch may be empty.
+    fn beyond_batch(&mut self) -> Beyond {
+        if self.ended {
+            return Beyond::End;
+        }
+        let Some(after) = self.after.take() else {
+            self.batch.clear();
+            self.at = 0;
+            self.after = self.decoder.batch(&mut self.input, &mut self.batch).transpose();
+            return Beyond::Batch;
+        };
+        match after {
+            Ok(Found::Record(record)) => {
+                self.batch.push(record);
+                Beyond::Batch
+            }
+            Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),
+            Ok(Found::End) => {
+                self.ended = true;
+                if self.input.compressed_data_cut() {
+                    let place = Place::Offset(self.input.offset());
+                    return Beyond::Issue(self.issue(place, Fault::Truncated("the compressed data")));
+                }
+                Beyond::End
+            }
+            Err(error) => {
+                let place = Place::Offset(self.input.offset());
+                Beyond::Issue(self.issue(place, Fault::Io(error)))
+            }
+        }
+    }
+
+    /// Puts the next records, at least one and as many as are at hand, in the place of what is in `records`: for loops
+    /// that [`Iterator::next`] would be the slowest part of. `None` at the end.
+    pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Option<Result<(), ReadIssue>> {
+        records.clear();
+        while self.at == self.batch.len() {
+            match self.beyond_batch() {
+                Beyond::Batch => {}
+                Beyond::Issue(issue) => return Some(Err(issue)),
+                Beyond::End => return None,
+            }
+        }
+        if self.at == 0 {
+            std::mem::swap(records, &mut self.batch);
+        } else {
+            records.extend(self.batch.drain(..).skip(self.at));
+        }
+        self.at = 0;
+        Some(Ok(()))
+    }
 }
 
 impl Iterator for TraceReader {
@@ -140,21 +229,15 @@ impl Iterator for TraceReader {
 
     #[inline]
     fn next(&mut self) -> Option<Self::Item> {
-        if self.ended {
-            return None;
-        }
-        match self.decoder.next(&mut self.input) {
-            Ok(Found::Record(record)) => Some(Ok(record)),
-            Ok(Found::Issue(place, fault)) => Some(Err(self.issue(place, fault))),
-            Ok(Found::End) => {
-                self.ended = true;
-                let cut = self.input.compressed_data_cut();
-                let place = Place::Offset(self.input.offset());
-                cut.then(|| Err(self.issue(place, Fault::Truncated("the compressed data"))))
+        loop {
+            if let Some(record) = self.batch.get(self.at) {
+                self.at += 1;
+                return Some(Ok(*record));
             }
-            Err(error) => {
-                let place = Place::Offset(self.input.offset());
-                Some(Err(self.issue(place, Fault::Io(error))))
+            match self.beyond_batch() {
+                Beyond::Batch => {}
+                Beyond::Issue(issue) => return Some(Err(issue)),
+                Beyond::End => return None,
             }
         }
     }

@@ -139,7 +139,7 @@ impl FileWriter {
 
     pub(crate) fn new(output: Output, format: Format, options: &WriteOptions) -> Self {
         let encoder: Box<dyn Encode> = match format {
-            Format::Candump => Box::new(candump::Encoder),
+            Format::Candump => Box::new(candump::Encoder::default()),
             Format::Asc => Box::new(asc::Encoder::default()),
             Format::Blf => Box::new(blf::Encoder::default()),
             Format::Trc(version) => Box::new(trc::Encoder::new(version)),

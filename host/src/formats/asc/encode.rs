@@ -1,7 +1,10 @@
 //! Writing ASC.
 
+use cantap_wire::Frame;
+
 use super::super::calendar::{DAYS, Date, MONTHS, start_of_trace};
 use super::super::event_text;
+use super::super::line::{Line, Seconds};
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::writer::{Encode, LeftOut};
@@ -9,10 +12,16 @@ use super::STATES;
 use crate::{Direction, TraceEvent, TraceRecord};
 
 /// Writes ASC.
-#[derive(Default)]
 pub(crate) struct Encoder {
     /// The time that the file's times count from; known with the first record.
     start_ns: Option<i64>,
+    seconds: Seconds<SECONDS_WIDTH>,
+}
+
+impl Default for Encoder {
+    fn default() -> Self {
+        Self { start_ns: None, seconds: Seconds::new() }
+    }
 }
 
 /// `Sat Sep 30 15:06:13.191 2017`.
@@ -29,9 +38,9 @@ fn push_date(out: &mut Vec<u8>, time_ns: i64) {
     out.extend_from_slice(text.as_bytes());
 }
 
-/// Spaces for the widths of the columns.
-const SPACES: &[u8] = b"                ";
+// Widths of the columns: a time, of it the whole seconds, and an identifier.
 const TIME_WIDTH: usize = 11;
+const SECONDS_WIDTH: usize = TIME_WIDTH - 7;
 const ID_WIDTH: usize = 16;
 
 impl Encoder {
@@ -54,30 +63,27 @@ impl Encode for Encoder {
             Some(start_ns) => start_ns,
             None => self.head(record.time_ns, out),
         };
-        push_offset(out, record.time_ns.saturating_sub(start_ns));
+        let offset_ns = record.time_ns.saturating_sub(start_ns);
+        if let TraceEvent::Frame { frame, direction, .. } = &record.event
+            && offset_ns >= 0
+        {
+            let mut line = Line::new();
+            self.seconds.put(&mut line, offset_ns as u64 / 1000);
+            line.space(1);
+            put_frame(&mut line, record.channel, frame, *direction);
+            line.end(out);
+            return;
+        }
+        let at = out.len();
+        text::push_time(out, offset_ns, NS_PER_S, 6, b'.');
+        text::pad_left(out, at, TIME_WIDTH);
+        out.push(b' ');
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
-                text::push_decimal(out, u64::from(record.channel));
-                out.extend_from_slice(b"  ");
-                let id = frame.id();
-                let digits = text::hex_len(id.raw());
-                text::push_hex(out, id.raw(), digits);
-                let mut width = digits;
-                if id.is_extended() {
-                    out.push(b'x');
-                    width += 1;
-                }
-                out.extend_from_slice(&SPACES[..ID_WIDTH - width]);
-                out.extend_from_slice(if *direction == Direction::Tx { b"Tx   " } else { b"Rx   " });
-                out.extend_from_slice(if frame.is_remote() { b"r " } else { b"d " });
-                text::push_hex(out, u32::from(frame.dlc()), 1);
-                // One append for all bytes.
-                let mut columns = [b' '; 3 * 8];
-                let data = frame.data();
-                for (column, byte) in columns.chunks_exact_mut(3).zip(data) {
-                    column[1..].copy_from_slice(&text::hex_pair_of(*byte));
-                }
-                out.extend_from_slice(&columns[..3 * data.len()]);
+                let mut line = Line::new();
+                put_frame(&mut line, record.channel, frame, *direction);
+                line.end(out);
+                return;
             }
             TraceEvent::BusError { kind, .. } => {
                 text::push_decimal(out, u64::from(record.channel));
@@ -117,34 +123,27 @@ impl Encode for Encoder {
     }
 }
 
-/// A time since the start in seconds, right-aligned, and a space.
+/// What stands behind the time of a frame.
 #[inline]
-fn push_offset(out: &mut Vec<u8>, offset_ns: i64) {
-    const US_PER_S: u64 = 1_000_000;
-    let us = offset_ns as u64 / 1000;
-    // Up to four digits of seconds the column is filled in place, without moving text.
-    if offset_ns < 0 || us >= 10_000 * US_PER_S {
-        let at = out.len();
-        text::push_time(out, offset_ns, NS_PER_S, 6, b'.');
-        text::pad_left(out, at, TIME_WIDTH);
-        out.push(b' ');
-        return;
+fn put_frame(line: &mut Line, channel: u8, frame: &Frame, direction: Direction) {
+    line.put_small(channel);
+    line.space(2);
+    let id = frame.id();
+    let mut width = line.put_hex(id.raw());
+    if id.is_extended() {
+        line.put(b"x");
+        width += 1;
     }
-    let mut column = [b' '; TIME_WIDTH + 1];
-    let (mut seconds, mut fraction) = ((us / US_PER_S) as u32, (us % US_PER_S) as u32);
-    for digit in column[5..TIME_WIDTH].iter_mut().rev() {
-        *digit = b'0' + (fraction % 10) as u8;
-        fraction /= 10;
+    line.space(ID_WIDTH - width);
+    line.put(if direction == Direction::Tx { b"Tx   " } else { b"Rx   " });
+    line.put(if frame.is_remote() { b"r " } else { b"d " });
+    line.put_hex(u32::from(frame.dlc()));
+    let mut columns = [b' '; 3 * 8];
+    for (column, byte) in columns.chunks_exact_mut(3).zip(frame.padded_data()) {
+        column[1..].copy_from_slice(&text::hex_pair_of(byte));
     }
-    column[4] = b'.';
-    for digit in column[..4].iter_mut().rev() {
-        *digit = b'0' + (seconds % 10) as u8;
-        seconds /= 10;
-        if seconds == 0 {
-            break;
-        }
-    }
-    out.extend_from_slice(&column);
+    line.put_start(&columns, 3 * frame.data_len());
+    line.put(b"\n");
 }
 
 fn push_status(out: &mut Vec<u8>, channel: u8) {

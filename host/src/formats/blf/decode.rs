@@ -98,6 +98,10 @@ enum Object {
 }
 
 impl Decode for Decoder {
+    fn needs_one_line(&self) -> bool {
+        false
+    }
+
     #[inline]
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if !self.started

@@ -2,9 +2,11 @@
 //! after at each poll; nothing here blocks.
 
 use cantap_wire::message::{
-    ChannelConfig, DEVICE_TAG, Filter, MAX_FILTERS, MAX_SEND, Periodic, Status, Trigger, TxFrame, capability,
+    ChannelConfig, DEVICE_TAG, Defaults, Filter, MAX_FILTERS, MAX_SEND, Periodic, Status, Trigger, TxFrame,
+    capability,
 };
-use cantap_wire::{CHANNELS, Channel, Command, Frame, Hello, PROTOCOL_VERSION, Refusal, Reply};
+use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
+use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
@@ -13,8 +15,8 @@ use crate::ports::{Board, Chip, Control, FilterBanks};
 use crate::transmit::{self, PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
-/// Most bytes that [`Chip::save`] must hold.
-pub const MAX_SAVED: usize = 2048;
+/// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each.
+pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12);
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After so long the
 /// bus is stuck, and the controller is made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
@@ -57,6 +59,7 @@ pub enum Work {
 }
 
 /// What a command comes to at once.
+#[expect(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum Step {
     /// It is done.
     Done(Reply),
@@ -121,7 +124,7 @@ impl Commands {
             Command::Close { channel } => return Ok(self.close(channel, board)),
             Command::Status => Reply::Status(self.status(board)),
             Command::Time => Reply::Time(board.with_capture(|capture, _, clock| capture.now(clock))),
-            Command::SetFilters { channel, filters } => self.set_filters(channel, filters, board)?,
+            Command::SetFilters { channel, filters } => self.set_filters(channel, &filters, board)?,
             Command::Send { channel, frames } => send(channel, &frames, board)?,
             Command::Abort { channel } => {
                 board.with_capture(|capture, traffic, clock| {
@@ -144,11 +147,10 @@ impl Commands {
             Command::Reset => return Ok(self.begin(Work::Restart, board)),
             Command::Bootloader => return Ok(self.begin(Work::Bootloader, board)),
             Command::SaveDefaults => self.save(board)?,
-            Command::ClearDefaults => {
-                if !board.chip().save(&[]) {
-                    return Err(Refusal::Hardware);
-                }
-                Reply::Done
+            Command::ClearDefaults => store(&[], board)?,
+            Command::Configure { channel, config } => self.configure(channel, config, board)?,
+            Command::Defaults { channel } => {
+                Reply::Defaults(saved(channel, board).ok_or(Refusal::NothingSaved)?)
             }
         };
         Ok(Step::Done(reply))
@@ -248,9 +250,10 @@ impl Commands {
         channel: Channel,
         board: &mut impl Board<'q, N>,
     ) -> Option<ChannelConfig> {
-        self.settings[channel.index()].config.or_else(|| load(board)?[channel.index()].config)
+        self.settings[channel.index()].config.or_else(|| saved(channel, board).map(|saved| saved.config))
     }
 
+    #[inline(never)]
     fn open<'q, const N: usize>(
         &mut self,
         channel: Channel,
@@ -261,18 +264,30 @@ impl Commands {
             return Err(Refusal::ChannelOpen);
         }
         let config = if let Some(config) = config {
+            check(&config)?;
             config
         } else {
-            let mut saved = load(board).ok_or(Refusal::NothingSaved)?;
-            let saved = core::mem::take(&mut saved[channel.index()]);
-            let config = saved.config.ok_or(Refusal::NothingSaved)?;
-            self.set_filters(channel, saved.filters, board)?;
+            let Defaults { config, filters } = saved(channel, board).ok_or(Refusal::NothingSaved)?;
+            check(&config)?;
+            // Last, because it is the one step that changes something.
+            self.set_filters(channel, &filters, board)?;
             config
         };
-        if !config.timing.is_valid() {
-            return Err(Refusal::BadTiming);
-        }
         Ok(self.begin(Work::Open(channel, config), board))
+    }
+
+    fn configure<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        config: ChannelConfig,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Reply, Refusal> {
+        if is_open(channel, board) {
+            return Err(Refusal::ChannelOpen);
+        }
+        check(&config)?;
+        self.settings[channel.index()].config = Some(config);
+        Ok(Reply::Done)
     }
 
     fn close<'q, const N: usize>(&mut self, channel: Channel, board: &mut impl Board<'q, N>) -> Step {
@@ -301,23 +316,24 @@ impl Commands {
     }
 
     /// Replaces a closed channel's filters.
+    #[inline(never)]
     fn set_filters<'q, const N: usize>(
         &mut self,
         channel: Channel,
-        filters: Vec<Filter, MAX_FILTERS>,
+        filters: &Vec<Filter, MAX_FILTERS>,
         board: &mut impl Board<'q, N>,
     ) -> Result<Reply, Refusal> {
         if is_open(channel, board) {
             return Err(Refusal::ChannelOpen);
         }
-        let layout = self.layout.with(channel, &filters)?;
+        let layout = self.layout.with(channel, filters)?;
         let other_open = Channel::ALL.iter().any(|&other| other != channel && is_open(other, board));
         if other_open && self.layout.disturbs(&layout) {
             return Err(Refusal::WouldDisturb);
         }
         board.filters().write(&layout);
         self.layout = layout;
-        self.settings[channel.index()].filters = filters;
+        self.settings[channel.index()].filters.clone_from(filters);
         let used = Channel::ALL.map(|channel| self.layout.used(channel));
         let banks_used = used[channel.index()];
         let others: usize = used.iter().sum::<usize>() - banks_used;
@@ -341,18 +357,35 @@ impl Commands {
         }
     }
 
-    /// Writing flash stops the processor for up to two seconds, so no channel may be open.
+    /// Stores each configured channel's settings beside what is stored for the other.
+    #[inline(never)]
     fn save<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
-        if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
-            return Err(Refusal::ChannelOpen);
-        }
         if self.settings.iter().all(|settings| settings.config.is_none()) {
             return Err(Refusal::NothingSaved);
         }
         let mut bytes = [0; MAX_SAVED];
-        let written = postcard::to_slice(&self.settings, &mut bytes).map_err(|_| Refusal::Hardware)?;
-        if board.chip().save(written) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }
+        let mut len = 0;
+        for (channel, settings) in Channel::ALL.into_iter().zip(&self.settings) {
+            let out = &mut bytes[len..];
+            let written = match saved(channel, board) {
+                Some(Defaults { config, filters }) if settings.config.is_none() => {
+                    postcard::to_slice(&ChannelSettings { config: Some(config), filters }, out)
+                }
+                _ => postcard::to_slice(settings, out),
+            };
+            // Cannot fail: so much is the most that there can be.
+            len += written.map_err(|_| Refusal::Hardware)?.len();
+        }
+        store(&bytes[..len], board)
     }
+}
+
+/// A configuration that a controller can be given. Beyond the bit rates, the arithmetic of deadlines does not hold.
+fn check(config: &ChannelConfig) -> Result<(), Refusal> {
+    let timing = &config.timing;
+    let possible =
+        timing.is_valid() && (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&timing.bitrate_bps(CAN_CLOCK_HZ));
+    if possible { Ok(()) } else { Err(Refusal::BadTiming) }
 }
 
 /// This firmware's version.
@@ -373,10 +406,30 @@ const fn parse(text: &str) -> u16 {
     value
 }
 
-fn load<'q, const N: usize>(board: &mut impl Board<'q, N>) -> Option<[ChannelSettings; CHANNELS]> {
+/// What is stored for a channel: one channel's settings stand behind the other's.
+///
+/// As the others that must not be inlined: each keeps bytes on the stack that the next does not need any more.
+#[inline(never)]
+fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Option<Defaults> {
     let mut bytes = [0; MAX_SAVED];
     let len = board.chip().load(&mut bytes);
-    postcard::from_bytes(bytes.get(..len)?).ok()
+    let mut rest = bytes.get(..len)?;
+    for at in Channel::ALL {
+        let (ChannelSettings { config, filters }, behind) = postcard::take_from_bytes(rest).ok()?;
+        if at == channel {
+            return Some(Defaults { config: config?, filters });
+        }
+        rest = behind;
+    }
+    None
+}
+
+/// Writing flash stops the processor for up to two seconds, so no channel may be open.
+fn store<'q, const N: usize>(bytes: &[u8], board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
+    if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
+        return Err(Refusal::ChannelOpen);
+    }
+    if board.chip().save(bytes) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }
 }
 
 fn is_open<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> bool {
@@ -392,24 +445,11 @@ fn stopped<'q, const N: usize>(channel: Channel, waited: u32, board: &mut impl B
     control.is_stopped()
 }
 
-/// Checks that a channel can send this frame.
-fn can_send<'q, const N: usize>(
-    channel: Channel,
-    frames: impl Iterator<Item = Frame>,
-    board: &mut impl Board<'q, N>,
-) -> Result<(), Refusal> {
+/// Checks that a channel can send.
+fn can_send<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Result<(), Refusal> {
     let config = board.with_capture(|capture, _, _| capture.config(channel).copied());
     let config = config.ok_or(Refusal::ChannelClosed)?;
-    if !config.mode.transmits() {
-        return Err(Refusal::ListenOnly);
-    }
-    for frame in frames {
-        // The controller sends a DLC above 8 as it is, and receivers take eight bytes.
-        if frame.dlc() > 15 {
-            return Err(Refusal::BadDlc);
-        }
-    }
-    Ok(())
+    if config.mode.transmits() { Ok(()) } else { Err(Refusal::ListenOnly) }
 }
 
 /// Queues frames, all or none.
@@ -418,7 +458,7 @@ pub fn send<'q, const N: usize>(
     frames: &Vec<TxFrame, MAX_SEND>,
     board: &mut impl Board<'q, N>,
 ) -> Result<Reply, Refusal> {
-    can_send(channel, frames.iter().map(|frame| frame.frame), board)?;
+    can_send(channel, board)?;
     if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
         return Err(Refusal::BadTag);
     }
@@ -450,7 +490,7 @@ fn set_periodic<'q, const N: usize>(
         return Err(Refusal::BadSlot);
     }
     if let Some(entry) = &entry {
-        can_send(channel, core::iter::once(entry.frame), board)?;
+        can_send(channel, board)?;
         if !transmit::is_valid(entry) {
             return Err(Refusal::BadEntry);
         }
@@ -473,7 +513,10 @@ fn set_trigger<'q, const N: usize>(
         return Err(Refusal::BadSlot);
     }
     if let Some(entry) = &entry {
-        can_send(channel, core::iter::once(entry.reply), board)?;
+        can_send(channel, board)?;
+        if !entry.filter.is_valid() {
+            return Err(Refusal::BadId);
+        }
     }
     board.with_capture(|capture, _, _| capture.transmitter(channel).set_trigger(slot as usize, entry));
     Ok(Reply::Done)

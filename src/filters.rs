@@ -165,10 +165,10 @@ impl Packer {
     }
 
     fn add(&mut self, filter: &Filter) -> Result<(), Refusal> {
-        let widest = if filter.extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
-        if filter.id > widest || filter.mask > widest {
+        if !filter.is_valid() {
             return Err(Refusal::BadId);
         }
+        let widest = if filter.extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
         let remote = u32::from(filter.kind == FrameKind::Remote);
         let listed = filter.mask == widest && filter.kind != FrameKind::Any;
         let kind_counts = u32::from(filter.kind != FrameKind::Any);

@@ -4,7 +4,7 @@
 //! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
 
 use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, seal, unseal};
-use cantap_wire::message::DeviceMessage;
+use cantap_wire::message::{DeviceMessage, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request, Response};
 
 use crate::QUEUE_BYTES;
@@ -18,8 +18,8 @@ use crate::slcan::{Answer, Slcan};
 
 /// Longest request on the wire, zero byte included.
 const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);
-/// Largest response before CRC and COBS: a status, a greeting and the registers are all below 256 bytes.
-const MAX_RESPONSE: usize = 512;
+/// Largest response before CRC and COBS: saved settings with as many filters as there can be, 12 bytes each.
+const MAX_RESPONSE: usize = MAX_REQUEST;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Language {
@@ -193,7 +193,7 @@ impl<'q, const N: usize> Session<'q, N> {
             unseal(encoded, &mut message).map(|message| {
                 (
                     postcard::take_from_bytes::<u16>(message).map(|(id, _)| id),
-                    postcard::from_bytes::<Request>(message),
+                    postcard::from_bytes::<Request>(message).map_err(|_| why_unreadable(message)),
                 )
             })
         });
@@ -207,9 +207,9 @@ impl<'q, const N: usize> Session<'q, N> {
                 }
             }
             // It was sent as it is, and is something that this device does not know.
-            Some(Ok((Ok(id), Err(_)))) => {
+            Some(Ok((Ok(id), Err(refusal)))) => {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
-                (id, Err(Refusal::Malformed))
+                (id, Err(refusal))
             }
             // Damaged: there is no telling whom to answer.
             _ => {

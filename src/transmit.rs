@@ -127,10 +127,11 @@ impl Transmitter {
         if self.dropping.is_some() { 0 } else { TX_QUEUE - self.queue.len() }
     }
 
-    /// Queues one frame; false if the queue is full.
+    /// Queues one frame; false if the queue is full. A frame that comes while the queue is being given up is given up
+    /// with it, and recorded like the others.
     pub fn enqueue(&mut self, frame: &TxFrame) -> bool {
         let queued = Queued { tag: frame.tag, frame: frame.frame, at: frame.at_ticks.unwrap_or(0) };
-        self.free() > 0 && self.queue.push_back(queued).is_ok()
+        self.queue.push_back(queued).is_ok()
     }
 
     /// Sets or clears a periodic entry; its first transmission is due at `now`.

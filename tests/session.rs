@@ -204,6 +204,7 @@ fn saved_defaults_open_a_channel_after_a_power_cycle() {
     assert_eq!(layout.used(CAN2), 1);
     assert_ne!(layout.banks[14].unwrap().second, 0);
     assert_eq!(bench.ask(Command::Open { channel: CAN1, config: None }), Err(Refusal::NothingSaved));
+    bench.ask(Command::Close { channel: CAN2 }).unwrap();
     bench.ask(Command::ClearDefaults).unwrap();
     assert!(bench.board.chip.saved.is_empty());
 }

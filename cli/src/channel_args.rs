@@ -1,11 +1,10 @@
 //! How a channel is opened; the same options in every command that opens one.
 
 use anyhow::{Context, bail};
-use cantap::bit_timing::TimingRequest;
 use cantap::filter::Filter;
-use cantap::wire::message::{ChannelConfig, Mode};
-use cantap::wire::{Command, Refusal, Reply};
-use cantap::{Address, Channel, Device, DeviceError, hw_filter};
+use cantap::hw_filter::{self, Compiled};
+use cantap::wire::message::{ChannelConfig, Defaults, Mode};
+use cantap::{Address, Channel, Device};
 
 use crate::timing_args::TimingArgs;
 
@@ -23,9 +22,9 @@ pub struct ChannelArgs {
     /// Send each frame once: no retransmission after an error or lost arbitration.
     #[arg(long)]
     one_shot: bool,
-    /// How to leave bus-off: by the controller itself, or only when asked.
-    #[arg(long, value_enum, default_value = "auto")]
-    recovery: Recovery,
+    /// How to leave bus-off: by the controller itself, as it does unless told otherwise, or only when asked.
+    #[arg(long, value_enum)]
+    recovery: Option<Recovery>,
     /// Leave data bytes out of the stream, to save bandwidth.
     #[arg(long)]
     no_data: bool,
@@ -54,80 +53,119 @@ enum Recovery {
     Manual,
 }
 
+/// What a channel is to be opened with.
+struct Plan {
+    channel: Channel,
+    config: ChannelConfig,
+    /// What is saved on the device, where that is used.
+    saved: Option<Defaults>,
+}
+
 impl ChannelArgs {
-    /// Opens channels, with `mode` unless the user says otherwise, and returns how. Says on standard error which
-    /// filters the hardware could not take. Whatever is impossible is found before the first is opened.
+    /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before
+    /// the first is opened. Commands that receive give their filters; with none of them, those saved on the device count.
+    /// Says on standard error which filters the hardware could not take, and that saved ones count.
     pub fn open(
         &self,
         device: &Device,
         channels: impl Iterator<Item = Channel>,
         mode: Mode,
-        filters: &[Filter],
+        filters: Option<&[Filter]>,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
-        let mut opened = Vec::new();
-        for channel in channels {
-            opened.push((channel, self.config(device, channel, mode)?));
-        }
+        let plans = self.plan(device, channels, Some(mode))?;
         // Filters of a channel can be changed only while both are closed.
-        for (channel, _) in opened.iter().filter(|_| !filters.is_empty()) {
-            if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
-                eprintln!("cantap: channel {}: {remainder}", channel.number());
+        for Plan { channel, saved, .. } in &plans {
+            match (filters, saved) {
+                (Some(filters), _) if !filters.is_empty() => {
+                    if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
+                        eprintln!("cantap: channel {}: {remainder}", channel.number());
+                    }
+                }
+                (Some(_), Some(saved)) if !saved.filters.is_empty() => {
+                    device.set_filters(*channel, &saved.filters)?;
+                    let (number, count) = (channel.number(), saved.filters.len());
+                    eprintln!("cantap: channel {number}: only what its {count} saved filters accept");
+                }
+                _ => {}
             }
         }
-        for (channel, config) in &opened {
+        for Plan { channel, config, .. } in &plans {
             device
                 .open_channel(*channel, Some(*config))
                 .with_context(|| format!("channel {}", channel.number()))?;
         }
-        Ok(opened)
+        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
-    /// The configuration that was asked for; where no bit timing was, the one saved on the device.
-    fn config(&self, device: &Device, channel: Channel, mode: Mode) -> anyhow::Result<ChannelConfig> {
+    /// Gives closed channels the configuration and filters that were asked for, without opening them: what
+    /// [`Device::save_defaults`] stores. What is not asked for stays as it was saved before.
+    pub fn configure(
+        &self,
+        device: &Device,
+        channels: impl Iterator<Item = Channel>,
+        filters: &[Filter],
+    ) -> anyhow::Result<()> {
+        for Plan { channel, config, saved } in self.plan(device, channels, None)? {
+            let number = channel.number();
+            let kept = saved.filter(|_| filters.is_empty()).map(|saved| saved.filters).unwrap_or_default();
+            let filters = match hw_filter::compile(filters, channel) {
+                Compiled { remainder: Some(remainder), .. } => bail!(
+                    "channel {number}: {remainder}, which cannot be saved; give filters that the hardware knows"
+                ),
+                Compiled { hardware, .. } if !hardware.is_empty() => hardware,
+                Compiled { .. } => kept.to_vec(),
+            };
+            device.set_filters(channel, &filters).with_context(|| format!("channel {number}"))?;
+            device.configure(channel, config).with_context(|| format!("channel {number}"))?;
+        }
+        Ok(())
+    }
+
+    fn plan(
+        &self,
+        device: &Device,
+        channels: impl Iterator<Item = Channel>,
+        mode: Option<Mode>,
+    ) -> anyhow::Result<Vec<Plan>> {
+        channels.map(|channel| self.plan_one(device, channel, mode)).collect()
+    }
+
+    /// The configuration that was asked for; where no bit timing was, the one saved on the device. The mode is the user's, else
+    /// `mode`, else the saved one.
+    fn plan_one(&self, device: &Device, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
         let is_virtual = matches!(device.name().parse(), Ok(Address::Virtual(_)));
-        let request = match self.timing.request(channel)? {
-            None if is_virtual => Some(TimingRequest::Rate {
-                bitrate_bps: VIRTUAL_BITRATE_BPS,
-                sample_point_percent: None,
-                sjw: None,
-            }),
-            request => request,
-        };
-        let saved = match request {
-            Some(request) => ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?),
-            None => saved_config(device, channel)?,
+        let (base, saved) = match self.timing.request(channel)? {
+            Some(request) => {
+                (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
+            }
+            None => match device.defaults(channel)? {
+                Some(saved) => (saved.config, Some(saved)),
+                None if is_virtual => (ChannelConfig::listen_only(device.timing(VIRTUAL_BITRATE_BPS)?), None),
+                None => bail!(
+                    "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
+                     with `cantap defaults save`",
+                    channel.number()
+                ),
+            },
         };
         let mode = match self.mode {
-            None => mode,
+            None => mode.unwrap_or(base.mode),
             Some(ModeArg::Listen) => Mode::ListenOnly,
             Some(ModeArg::Normal) => Mode::Normal,
             Some(ModeArg::Loopback) => Mode::Loopback,
             Some(ModeArg::SilentLoopback) => Mode::SilentLoopback,
         };
-        Ok(ChannelConfig {
+        let config = ChannelConfig {
             mode,
-            one_shot: saved.one_shot || self.one_shot,
-            manual_recovery: saved.manual_recovery || self.recovery == Recovery::Manual,
-            omit_data: saved.omit_data || self.no_data,
-            omit_stamps: saved.omit_stamps || self.no_stamps,
-            ..saved
-        })
-    }
-}
-
-/// What is saved on the device. The protocol tells it by opening the channel with it, which is undone at once.
-fn saved_config(device: &Device, channel: Channel) -> anyhow::Result<ChannelConfig> {
-    match device.request(Command::Open { channel, config: None }) {
-        Ok(Reply::Opened(config)) => {
-            device.close_channel(channel)?;
-            Ok(config)
-        }
-        Err(DeviceError::Refused { refusal: Refusal::NothingSaved }) => bail!(
-            "no bit rate: give one with -b RATE, find it with `cantap autobaud`, or save one with \
-             `cantap defaults save`"
-        ),
-        Err(error) => Err(error.into()),
-        Ok(_) => Err(DeviceError::WrongReply.into()),
+            one_shot: base.one_shot || self.one_shot,
+            manual_recovery: self
+                .recovery
+                .map_or(base.manual_recovery, |recovery| recovery == Recovery::Manual),
+            omit_data: base.omit_data || self.no_data,
+            omit_stamps: base.omit_stamps || self.no_stamps,
+            ..base
+        };
+        Ok(Plan { channel, config, saved })
     }
 }
 

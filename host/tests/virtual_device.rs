@@ -4,6 +4,7 @@
 use std::io::Read;
 use std::time::{Duration, Instant};
 
+use cantap::autobaud;
 use cantap::device::{Device, Link};
 use cantap::simbus::Frames;
 use cantap::virtual_device::{Options, Pace, SequenceCheck, start};
@@ -165,6 +166,44 @@ fn two_channels_on_one_wire_hear_each_other() {
     device.send(Channel::Can1, &[TxFrame { tag: 1, frame, at_ticks: None }]).unwrap();
     let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
     collect(&device, |record| record.channel == 2 && record.event == event);
+}
+
+/// The bus's own view: the controllers drove not one dominant bit.
+#[test]
+fn whatever_only_listens_never_drives_the_bus() {
+    let pace = Pace::RealTime;
+    let bus = Options { bitrate_bps: Some(250_000), error_percent: 2.0, pace, ..options(60.0, Frames::Mix) };
+    let connection = start(bus).unwrap();
+    let witness = connection.witness.clone();
+    let device = Device::over(connection.into_link(), "virtual").unwrap();
+    let normal = config(&device, Mode::Normal);
+    for channel in Channel::ALL {
+        device.configure(channel, normal).unwrap();
+    }
+    device.save_defaults().unwrap();
+    assert_eq!(device.defaults(Channel::Can2).unwrap().unwrap().config, normal);
+    let found =
+        autobaud::search(&device, Channel::Can1, &autobaud::Limits::default(), &mut |_| true).unwrap();
+    assert!(matches!(found, autobaud::Outcome::Found { bitrate_bps: 250_000, .. }), "{found:?}");
+    // At the right rate, and at a wrong one.
+    device.listen(Channel::Can1, 250_000).unwrap();
+    device.listen(Channel::Can2, BITRATE).unwrap();
+    let mut count = 0;
+    collect(&device, |_| {
+        count += 1;
+        count == 500
+    });
+    assert_eq!(witness.heard().driven, [0, 0]);
+    device.close_channel(Channel::Can1).unwrap();
+    let timing = device.timing(250_000).unwrap();
+    device.open_channel(Channel::Can1, Some(ChannelConfig { timing, ..normal })).unwrap();
+    let mut count = 0;
+    collect(&device, |_| {
+        count += 1;
+        count == 50
+    });
+    let heard = witness.heard();
+    assert!(heard.driven[0] > 0 && heard.driven[1] == 0, "{heard:?}");
 }
 
 #[test]

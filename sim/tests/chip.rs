@@ -58,6 +58,8 @@ fn the_stack_is_never_used_beyond_three_quarters() {
         rig.close(channel).unwrap();
     }
     rig.ask(Command::SaveDefaults).unwrap();
+    rig.ask(Command::Defaults { channel: Channel::Can2 }).unwrap();
+    rig.ask(Command::Open { channel: Channel::Can2, config: None }).unwrap();
     let mut stack = vec![0; STACK_LEN];
     assert!(rig.machine.cpu().memory(STACK).unwrap().read(STACK, &mut stack));
     // Memory is zero at power-on, and the deepest word that was ever pushed is not.

@@ -3,6 +3,8 @@
 use core::fmt;
 use core::str::FromStr;
 
+use crate::Refusal;
+
 /// An identifier of 11 (standard) or 29 bits (extended).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Id(u32);
@@ -141,7 +143,7 @@ impl Frame {
 
 /// A frame inside a command or event: postcard's ordinary encoding of these three fields.
 #[derive(serde::Serialize, serde::Deserialize)]
-struct Packed {
+pub(crate) struct Packed {
     /// Bit 31: extended. Bit 30: remote. Bits 28..0: the identifier.
     id: u32,
     dlc: u8,
@@ -160,21 +162,26 @@ impl From<Frame> for Packed {
     }
 }
 
+impl Packed {
+    /// The frame, or what keeps it from being one.
+    pub(crate) fn frame(&self) -> Result<Frame, Refusal> {
+        let raw = self.id & !(EXTENDED | PACKED_REMOTE);
+        let id = if self.id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
+        let id = id.ok_or(Refusal::BadId)?;
+        let remote = self.id & PACKED_REMOTE != 0;
+        let mut data = [0; 8];
+        data[..self.data.len()].copy_from_slice(&self.data);
+        let frame = Frame::from_bus(id, remote, self.dlc & 15, data);
+        let is_right = self.dlc <= 15 && frame.data_len() == self.data.len();
+        if is_right { Ok(frame) } else { Err(Refusal::BadDlc) }
+    }
+}
+
 impl TryFrom<Packed> for Frame {
     type Error = &'static str;
 
     fn try_from(packed: Packed) -> Result<Self, Self::Error> {
-        let raw = packed.id & !(EXTENDED | PACKED_REMOTE);
-        let id = if packed.id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
-        let id = id.ok_or("identifier too large")?;
-        let remote = packed.id & PACKED_REMOTE != 0;
-        if packed.dlc > 15 {
-            return Err("DLC above 15");
-        }
-        let mut data = [0; 8];
-        data[..packed.data.len()].copy_from_slice(&packed.data);
-        let frame = Frame::from_bus(id, remote, packed.dlc, data);
-        if frame.data_len() == packed.data.len() { Ok(frame) } else { Err("data disagrees with DLC") }
+        packed.frame().map_err(|_| "identifier or length out of range")
     }
 }
 

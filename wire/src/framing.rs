@@ -7,8 +7,9 @@ use crc::Crc;
 
 /// Largest message before CRC and COBS, in bytes, in either direction.
 pub const MAX_MESSAGE: usize = 2048;
-/// Largest request before CRC and COBS, in bytes: what a device must be ready to hold.
-pub const MAX_REQUEST: usize = 512;
+/// Largest request before CRC and COBS, in bytes: what a device must be ready to hold. The longest there is sets
+/// [`MAX_FILTERS`](crate::message::MAX_FILTERS) filters of 12 bytes each.
+pub const MAX_REQUEST: usize = 704;
 /// Bytes of the CRC, which stands little-endian behind the message.
 pub const CRC_LEN: usize = 4;
 

@@ -21,7 +21,7 @@ pub use timing::BitTiming;
 
 /// Version of everything this crate defines. A device and a host with different versions refuse
 /// each other with a message that says which side to update.
-pub const PROTOCOL_VERSION: u16 = 1;
+pub const PROTOCOL_VERSION: u16 = 2;
 
 /// Name of the ELF symbol that holds [`PROTOCOL_VERSION`] as a little-endian `u16` in the
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.

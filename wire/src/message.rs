@@ -5,8 +5,9 @@ use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
 use crate::batch::BatchHeader;
+use crate::frame::Packed;
 use crate::record::{BusErrorKind, ErrorState};
-use crate::{BitTiming, CHANNELS, Channel, Frame};
+use crate::{BitTiming, CHANNELS, Channel, Frame, Id};
 
 /// Most filters that one channel takes; the hardware's banks may be exhausted earlier.
 pub const MAX_FILTERS: usize = 56;
@@ -31,6 +32,7 @@ pub struct Request {
 
 /// Device → host.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[allow(clippy::large_enum_variant, reason = "no allocation on the device")]
 pub enum DeviceMessage {
     /// Records follow behind the header.
     Batch(BatchHeader),
@@ -129,10 +131,49 @@ pub enum Command {
     Reset,
     /// Enters the chip's ROM bootloader (USB DFU) after the response is sent.
     Bootloader,
-    /// Stores both channels' present configuration and filters, to be used by [`Command::Open`] without one.
+    /// Stores the configuration and filters that each channel has in this session, to be used by [`Command::Open`] without
+    /// one. A channel that has no configuration yet keeps what is stored for it. Both channels must be closed.
     SaveDefaults,
-    /// Erases what [`Command::SaveDefaults`] stored.
+    /// Erases what [`Command::SaveDefaults`] stored. Both channels must be closed.
     ClearDefaults,
+    /// Gives a closed channel a configuration without opening it, for [`Command::SaveDefaults`].
+    Configure {
+        /// Which.
+        channel: Channel,
+        /// How [`Command::SaveDefaults`] says that it is to be opened.
+        config: ChannelConfig,
+    },
+    /// Asks for what is stored for a channel. Nothing is opened, and nothing changes.
+    Defaults {
+        /// Which.
+        channel: Channel,
+    },
+}
+
+/// Why a request, sealed as it was sent, cannot be read: [`Refusal::BadId`] or [`Refusal::BadDlc`] where it carries a frame
+/// that cannot be, else [`Refusal::Malformed`].
+pub fn why_unreadable(request: &[u8]) -> Refusal {
+    // The indices of commands that carry frames, as the pinned bytes have them.
+    const SEND: u32 = 6;
+    const SET_PERIODIC: u32 = 8;
+    const SET_TRIGGER: u32 = 9;
+    type Head = (u16, u32, Channel);
+    let fault = || {
+        let ((_, command, _), rest) = postcard::take_from_bytes::<Head>(request).ok()?;
+        match command {
+            SEND => {
+                type Frames = Vec<(u32, Packed, Option<u64>), MAX_SEND>;
+                let (frames, _) = postcard::take_from_bytes::<Frames>(rest).ok()?;
+                frames.iter().find_map(|(_, frame, _)| frame.frame().err())
+            }
+            SET_PERIODIC => postcard::take_from_bytes::<(u8, u8, Packed)>(rest).ok()?.0.2.frame().err(),
+            SET_TRIGGER => {
+                postcard::take_from_bytes::<(u8, u8, Filter, Packed)>(rest).ok()?.0.3.frame().err()
+            }
+            _ => None,
+        }
+    };
+    fault().unwrap_or(Refusal::Malformed)
 }
 
 /// A value that answers a request.
@@ -163,6 +204,17 @@ pub enum Reply {
     },
     /// To [`Command::Registers`].
     Registers(Registers),
+    /// To [`Command::Defaults`].
+    Defaults(Defaults),
+}
+
+/// What is stored for a channel over a power cycle.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Defaults {
+    /// How it is opened.
+    pub config: ChannelConfig,
+    /// What it receives; none means everything.
+    pub filters: Vec<Filter, MAX_FILTERS>,
 }
 
 /// Why a request was refused. Nothing has changed.
@@ -179,11 +231,11 @@ pub enum Refusal {
     NoSession,
     /// This device cannot do that.
     Unsupported,
-    /// The bit timing is outside the controller's ranges.
+    /// The bit timing is outside the controller's ranges, or the bit rate outside 5 kbit/s to 1 Mbit/s.
     BadTiming,
     /// An identifier or filter is out of range.
     BadId,
-    /// A DLC is out of range.
+    /// A DLC is above 15, or the data are not as long as it says.
     BadDlc,
     /// A tag is in the device's own range.
     BadTag,
@@ -342,6 +394,12 @@ pub struct Filter {
 }
 
 impl Filter {
+    /// Whether identifier and mask have no more bits than identifiers of this length.
+    pub const fn is_valid(&self) -> bool {
+        let widest = if self.extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+        self.id <= widest && self.mask <= widest
+    }
+
     /// Whether this filter lets `frame` pass.
     pub fn matches(&self, frame: &Frame) -> bool {
         let kind = match self.kind {

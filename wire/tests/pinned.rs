@@ -3,9 +3,10 @@
 
 use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
+use cantap_wire::framing::MAX_REQUEST;
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, DeviceMessage, Filter, FrameKind, Mode, Modifier, Periodic,
-    RegisterSet, Registers, Status, Trigger, TxFrame, capability,
+    ChannelConfig, ChannelStatus, Checksum, Defaults, DeviceMessage, Filter, FrameKind, MAX_FILTERS, Mode,
+    Modifier, Periodic, RegisterSet, Registers, Status, Trigger, TxFrame, capability, why_unreadable,
 };
 use cantap_wire::record::{
     BusErrorKind, ErrorState, LossStage, MAX_RECORD, TransmitFailure, encode_event, encode_received,
@@ -33,7 +34,7 @@ const TIMING: BitTiming = BitTiming { prescaler: 300, segment1: 13, segment2: 2,
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 1);
+    assert_eq!(PROTOCOL_VERSION, 2);
 }
 
 #[test]
@@ -120,7 +121,7 @@ fn commands() {
     };
     let tx = |tag, at_ticks| TxFrame { tag, frame, at_ticks };
     for (command, expected) in [
-        (Command::Hello { protocol: 1 }, "00 01"),
+        (Command::Hello { protocol: 2 }, "00 02"),
         (Command::Open { channel, config: None }, "01 01 00"),
         (Command::Open { channel, config: Some(config) }, "01 01 01 ac 02 0d 02 01 00 01 00 00 00"),
         (Command::Close { channel }, "02 01"),
@@ -149,6 +150,8 @@ fn commands() {
         (Command::Bootloader, "0e"),
         (Command::SaveDefaults, "0f"),
         (Command::ClearDefaults, "10"),
+        (Command::Configure { channel, config }, "11 01 ac 02 0d 02 01 00 01 00 00 00"),
+        (Command::Defaults { channel }, "12 01"),
     ] {
         assert_eq!(
             bytes(&Request { id: 300, command: command.clone() }),
@@ -165,8 +168,9 @@ fn commands() {
 fn replies() {
     let config =
         ChannelConfig { manual_recovery: true, omit_data: true, ..ChannelConfig::listen_only(TIMING) };
+    let filter = Filter { extended: true, kind: FrameKind::Remote, id: 300, mask: 1 };
     let hello = Hello {
-        protocol: 1,
+        protocol: 2,
         firmware: [0, 1, 300],
         board: "ab".try_into().unwrap(),
         serial: "c".try_into().unwrap(),
@@ -221,7 +225,7 @@ fn replies() {
     for (reply, expected) in [
         (
             Reply::Hello(hello),
-            "00 01 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
+            "00 02 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
         ),
         (Reply::Done, "01"),
         (Reply::Opened(config), "02 ac 02 0d 02 01 00 00 01 01 00"),
@@ -237,6 +241,10 @@ fn replies() {
         (
             Reply::Registers(Registers { now: set, at_last_error: Some(set) }),
             "07 01 02 03 04 05 06 07 01 01 02 03 04 05 06 07",
+        ),
+        (
+            Reply::Defaults(Defaults { config, filters: [filter].into_iter().collect() }),
+            "08 ac 02 0d 02 01 00 00 01 01 00 01 01 01 ac 02 01",
         ),
     ] {
         let message = DeviceMessage::Response(Response { id: 5, result: Ok(reply) });
@@ -277,4 +285,40 @@ fn refusals() {
 fn batch_headers() {
     let header = BatchHeader { sequence: 300, base_ticks: 1 << 32, frames_before: [128, 1] };
     assert_eq!(bytes(&DeviceMessage::Batch(header)), "00 ac 02 80 80 80 80 10 80 01 01");
+}
+
+/// Requests of a client that does not keep to the ranges, byte by byte.
+#[test]
+fn a_frame_that_cannot_be_is_refused_by_its_fault_and_all_else_as_malformed() {
+    let refusal = |text: &str| {
+        let request: Vec<u8> = text.split(' ').map(|byte| u8::from_str_radix(byte, 16).unwrap()).collect();
+        assert!(postcard::from_bytes::<Request>(&request).is_err(), "{text} is a good request");
+        why_unreadable(&request)
+    };
+    for (text, expected) in [
+        // Send: a good frame and one with the standard identifier 800.
+        ("05 06 00 02 01 a3 02 01 01 11 00 02 80 10 00 00 00", Refusal::BadId),
+        // DLC 16, and two bytes of data for DLC 1.
+        ("05 06 00 01 01 a3 02 10 08 01 02 03 04 05 06 07 08 00", Refusal::BadDlc),
+        ("05 06 00 01 01 a3 02 01 02 01 02 00", Refusal::BadDlc),
+        ("05 08 00 00 01 80 10 00 00 ac 02 00 00", Refusal::BadId),
+        ("05 08 00 00 01 a3 02 10 00 ac 02 00 00", Refusal::BadDlc),
+        ("05 09 00 00 01 00 02 01 01 80 10 00 00 00", Refusal::BadId),
+        // A third channel, a command that does not exist, one that is cut off, and nothing.
+        ("05 06 02 00", Refusal::Malformed),
+        ("05 7f", Refusal::Malformed),
+        ("05 06 00 01 01", Refusal::Malformed),
+        ("05", Refusal::Malformed),
+    ] {
+        assert_eq!(refusal(text), expected, "{text}");
+    }
+}
+
+/// Every request there can be fits what a device holds.
+#[test]
+fn the_longest_request_fits() {
+    let filter = Filter { extended: true, kind: FrameKind::Any, id: 0x1FFF_FFFF, mask: 0x1FFF_FFFF };
+    let filters = [filter; MAX_FILTERS].into_iter().collect();
+    let request = Request { id: u16::MAX, command: Command::SetFilters { channel: Can2, filters } };
+    assert!(postcard::to_slice(&request, &mut [0; MAX_REQUEST]).is_ok());
 }

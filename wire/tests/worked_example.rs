@@ -17,7 +17,7 @@ fn documented(heading: &str) -> Vec<u8> {
 #[test]
 fn the_request_is_what_the_document_says() {
     let mut message = [0; MAX_MESSAGE + CRC_LEN];
-    let request = Request { id: 1, command: Command::Hello { protocol: 1 } };
+    let request = Request { id: 1, command: Command::Hello { protocol: 2 } };
     let len = postcard::to_slice(&request, &mut message).unwrap().len();
     let mut out = [0; MAX_ENCODED];
     let len = seal(&mut message, len, &mut out).unwrap();

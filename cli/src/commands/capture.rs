@@ -113,15 +113,16 @@ fn needs_bit_rate(args: &Args) -> anyhow::Result<bool> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    // Only a board can have a bit rate saved.
-    if matches!(args.device, Address::Virtual(_)) && needs_bit_rate(args)? {
+    // A virtual device without settings has no bit rate saved.
+    let may_be_saved = !matches!(&args.device, Address::Virtual(options) if !options.contains("settings="));
+    if !may_be_saved && needs_bit_rate(args)? {
         let message = "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     let mut sink = Sink::create(args)?;
-    let opened = args.open.open(&device, args.channel.iter(), Mode::ListenOnly, &args.filter)?;
+    let opened = args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&args.filter))?;
     let started = Instant::now();
     let bitrate = |channel| {
         // A channel that is not open has no frames, whatever its rate.

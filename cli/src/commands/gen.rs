@@ -175,7 +175,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     let mut bitrates_bps = [0; CHANNELS];
-    for (channel, config) in args.open.open(&device, [args.channel].into_iter(), Mode::Normal, &[])? {
+    for (channel, config) in args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)? {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
     }
     let gap = Duration::from_secs_f64(args.gap / 1e3);

@@ -7,6 +7,7 @@ pub mod care;
 pub mod completions;
 pub mod convert;
 pub mod decode;
+pub mod defaults;
 pub mod demo;
 pub mod diff;
 pub mod r#gen;
@@ -20,6 +21,7 @@ pub mod send;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
 
@@ -74,9 +76,9 @@ pub enum Command {
     /// Restart a device's firmware.
     Reset(care::Reset),
     /// Bring a device into its USB bootloader and write a firmware.
-    Update(care::Update),
+    Update(update::Args),
     /// Keep a configuration on the device over a power cycle, or erase it.
-    Defaults(Box<care::Defaults>),
+    Defaults(Box<defaults::Args>),
 }
 
 impl Command {
@@ -106,8 +108,8 @@ impl Command {
             Self::Replay(args) => replay::run(&args),
             Self::Identify(args) => care::identify(&args),
             Self::Reset(args) => care::reset(&args),
-            Self::Update(args) => care::update(&args),
-            Self::Defaults(args) => care::defaults(&args),
+            Self::Update(args) => update::run(&args),
+            Self::Defaults(args) => defaults::run(&args),
         }
     }
 }

@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let device = Device::open(&args.device)?;
     let mut bitrates_bps = [0; CHANNELS];
-    for (channel, config) in args.open.open(&device, args.channels().into_iter(), Mode::Normal, &[])? {
+    for (channel, config) in args.open.open(&device, args.channels().into_iter(), Mode::Normal, None)? {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
     }
     let pace = Pace {

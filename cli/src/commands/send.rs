@@ -77,7 +77,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .transpose()?;
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
-    args.open.open(&device, [args.channel].into_iter(), Mode::Normal, &[])?;
+    args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
     let mut tally = Tally::new(args.quiet);
     let waiting = match (triggers, periodic) {
         (Some(triggers), _) => {

@@ -15,10 +15,12 @@ use crate::interrupt;
                         bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
                         errors=PCT       share of the frames that are destroyed (0)\n  \
+                        disturb=N        the first N frames that the device sends are destroyed: 32 make it bus-off (0)\n  \
                         ack=yes|no       whether simulated nodes acknowledge (yes)\n  \
                         wire=apart|joined  a bus for each channel, or one for both (apart)\n  \
                         channels=1|2|both  which buses have traffic (both)\n  \
                         seed=N           another sequence of frames (1)\n  \
+                        settings=FILE    where the device keeps what it saves, over a power cycle\n  \
                         pace=real|fast   real time, or as fast as the host reads (real)\n  \
                         log=FILE         replay a trace file at its own times; must come last\n\n\
                         The same options follow `virtual:` wherever a device is asked for.\n\n\
@@ -38,6 +40,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     out.flush()?;
     eprintln!("cantap: the virtual device is at {}; Ctrl-C ends it", terminal.path());
     while !interrupt::requested() {
+        if !terminal.is_running() {
+            eprintln!(
+                "cantap: the virtual device left its firmware for a bootloader, which it does not have: it is gone"
+            );
+            break;
+        }
         std::thread::sleep(Duration::from_millis(50));
     }
     Ok(ExitCode::SUCCESS)

@@ -68,6 +68,7 @@ pub struct Transmission {
 
 /// What else the stream says, beside records.
 #[derive(Clone, Debug, PartialEq, Eq)]
+#[expect(clippy::large_enum_variant, reason = "handed on at once, a few in a second")]
 pub enum Notice {
     /// An answer.
     Response(Response),

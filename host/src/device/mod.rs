@@ -22,7 +22,7 @@ use std::sync::mpsc::{Receiver, Sender, sync_channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{ChannelConfig, Filter, Periodic, Registers, Status, Trigger, TxFrame};
+use cantap_wire::message::{ChannelConfig, Defaults, Filter, Periodic, Registers, Status, Trigger, TxFrame};
 use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
@@ -146,7 +146,8 @@ impl Device {
             .map_err(|reason| DeviceError::BitRate { bitrate_bps, reason })
     }
 
-    /// Opens a channel; without a configuration, with the one saved on the device. Returns what was applied.
+    /// Opens a channel; without a configuration, with the one saved on the device, whatever its mode: [`Self::defaults`]
+    /// tells it beforehand. Returns what was applied.
     pub fn open_channel(
         &self,
         channel: Channel,
@@ -343,7 +344,23 @@ impl Device {
         self.done(Command::Bootloader)
     }
 
-    /// Stores both channels' configuration and filters on the device.
+    /// Gives a closed channel the configuration that [`Self::save_defaults`] stores, without opening it.
+    pub fn configure(&self, channel: Channel, config: ChannelConfig) -> Result<(), DeviceError> {
+        self.done(Command::Configure { channel, config })
+    }
+
+    /// What is stored on the device for a channel, if anything is. Nothing is opened.
+    pub fn defaults(&self, channel: Channel) -> Result<Option<Defaults>, DeviceError> {
+        match self.request(Command::Defaults { channel }) {
+            Ok(Reply::Defaults(defaults)) => Ok(Some(defaults)),
+            Err(DeviceError::Refused { refusal: Refusal::NothingSaved }) => Ok(None),
+            Ok(_) => Err(DeviceError::WrongReply),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Stores the filters and configuration that each channel has in this session on the device; a channel that has none
+    /// keeps what is stored.
     pub fn save_defaults(&self) -> Result<(), DeviceError> {
         self.done(Command::SaveDefaults)
     }

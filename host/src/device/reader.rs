@@ -24,6 +24,7 @@ const READ_BYTES: usize = 64 * 1024;
 const CLOCK_EVERY: Duration = Duration::from_secs(1);
 
 /// What a request's answer can be.
+#[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
 pub(super) enum Answer {
     Response(Response),
     OtherProtocol(u16),

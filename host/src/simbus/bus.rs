@@ -51,6 +51,8 @@ pub struct SimBus {
     others_acknowledge: bool,
     /// Share of the simulated nodes' frames that are destroyed, in per cent.
     error_percent: f64,
+    /// The controllers' next frames so many are destroyed.
+    disturbed: u32,
     random: fastrand::Rng,
     phase: Phase,
 }
@@ -63,6 +65,7 @@ impl SimBus {
             traffic,
             others_acknowledge: true,
             error_percent: 0.0,
+            disturbed: 0,
             random: fastrand::Rng::with_seed(seed),
             phase: Phase::Free { from_ns: 0 },
         }
@@ -78,6 +81,13 @@ impl SimBus {
     #[must_use]
     pub fn with_errors(self, error_percent: f64) -> Self {
         Self { error_percent, ..self }
+    }
+
+    /// Destroys the first frames of the controllers that are given to each call, each time that they send one: so many bit
+    /// errors. 32 in a row make a controller bus-off.
+    #[must_use]
+    pub fn disturbing(self, frames: u32) -> Self {
+        Self { disturbed: frames, ..self }
     }
 
     /// When something happens next; `u64::MAX` if nothing will before a node changes.
@@ -165,6 +175,11 @@ impl SimBus {
         if sender.is_none() && self.error_percent > 0.0 && self.random.f64() * 100.0 < self.error_percent {
             const KINDS: [BusErrorKind; 3] = [BusErrorKind::Stuff, BusErrorKind::Form, BusErrorKind::Crc];
             return Some(KINDS[self.random.usize(..KINDS.len())]);
+        }
+        if let (Some(_), Some(left)) = (sender, self.disturbed.checked_sub(1)) {
+            self.disturbed = left;
+            let kind = if left % 2 == 0 { BusErrorKind::BitDominant } else { BusErrorKind::BitRecessive };
+            return Some(kind);
         }
         let in_step =
             |node: &&mut dyn Node| node.bitrate_bps().is_some_and(|own| same_rate(own, bitrate_bps));

@@ -13,19 +13,28 @@ use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
 use cantap_wire::{CHANNELS, Channel};
 
 use super::controller::{ControlSide, Controller, TrafficSide};
+use super::flash::Flash;
 use crate::device::{PipeReader, PipeWriter};
 
 /// Bulk packets in each millisecond: 1.02 MB/s. Full speed would allow 19 (USB 2.0, table 5-9).
 const PACKETS_PER_MS: u32 = 16;
 
 /// Model time, seen as the firmware's stamp timer.
+#[expect(clippy::struct_field_names, reason = "units")]
 #[derive(Default)]
 pub struct ModelClock {
     now_ns: Cell<u64>,
+    /// When the firmware started.
+    started_ns: u64,
     alarm_ns: Cell<Option<u64>>,
 }
 
 impl ModelClock {
+    /// The clock of a firmware that starts now.
+    pub fn started_at(now_ns: u64) -> Self {
+        Self { now_ns: Cell::new(now_ns), started_ns: now_ns, ..Self::default() }
+    }
+
     pub fn set(&self, now_ns: u64) {
         self.now_ns.set(now_ns);
     }
@@ -41,7 +50,7 @@ impl ModelClock {
     }
 
     fn ticks(&self) -> u64 {
-        (u128::from(self.now_ns.get()) * u128::from(TICK_HZ) / 1_000_000_000) as u64
+        (u128::from(self.now_ns.get() - self.started_ns) * u128::from(TICK_HZ) / 1_000_000_000) as u64
     }
 }
 
@@ -56,18 +65,26 @@ impl Clock for ModelClock {
             let ahead = at.wrapping_sub(now as u32) as i32;
             // One that has passed goes off a tick from now, as a handler that is left takes a moment to be entered again.
             let at = now + u64::from(ahead.max(1) as u32);
-            (u128::from(at) * 1_000_000_000).div_ceil(u128::from(TICK_HZ)) as u64
+            self.started_ns + (u128::from(at) * 1_000_000_000).div_ceil(u128::from(TICK_HZ)) as u64
         });
         self.alarm_ns.set(at_ns);
     }
 }
 
-/// The chip: storage that lasts as long as the virtual device.
-#[derive(Default)]
+/// How the firmware ends.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ending {
+    /// It starts again.
+    Restart,
+    /// The chip is in its bootloader. There is none here, and nothing to flash: the device is gone.
+    Bootloader,
+}
+
+/// The chip.
 pub struct VirtualChip {
-    saved: Vec<u8>,
-    /// The firmware asked for a restart; it is one for the host, too.
-    pub restarts: bool,
+    pub flash: Flash,
+    /// The firmware asked for it.
+    pub ending: Option<Ending>,
 }
 
 impl Chip for VirtualChip {
@@ -82,23 +99,20 @@ impl Chip for VirtualChip {
     fn identify(&mut self, _seconds: u8) {}
 
     fn reset(&mut self) {
-        self.restarts = true;
+        self.ending = Some(Ending::Restart);
     }
 
     fn bootloader(&mut self) -> bool {
-        self.restarts = true;
+        self.ending = Some(Ending::Bootloader);
         true
     }
 
     fn save(&mut self, bytes: &[u8]) -> bool {
-        self.saved = bytes.to_vec();
-        true
+        self.flash.save(bytes)
     }
 
     fn load(&mut self, out: &mut [u8]) -> usize {
-        let len = self.saved.len().min(out.len());
-        out[..len].copy_from_slice(&self.saved[..len]);
-        len
+        self.flash.load(out)
     }
 }
 

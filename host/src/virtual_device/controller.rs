@@ -69,6 +69,8 @@ pub struct Controller {
     pub interrupts: Interrupts,
     /// Frames on the bus that passed the filters while the controller took part, delivered to the FIFO or not.
     pub heard: u64,
+    /// Times that it put a dominant level on a bus that others hear.
+    pub driven: u64,
 }
 
 impl Controller {
@@ -92,6 +94,7 @@ impl Controller {
             recovers_at_ns: None,
             interrupts: Interrupts::default(),
             heard: 0,
+            driven: 0,
         }
     }
 
@@ -216,6 +219,7 @@ impl Node for Controller {
 
     fn on_start(&mut self) {
         self.sending = true;
+        self.driven += u64::from(self.mode() != Some(Mode::SilentLoopback));
     }
 
     fn on_lost(&mut self) {
@@ -237,6 +241,8 @@ impl Node for Controller {
             self.tec = self.tec.saturating_sub(1);
             self.finish_first(Outcome::Sent);
         } else {
+            // It acknowledges, whatever its filters say.
+            self.driven += u64::from(self.mode() == Some(Mode::Normal));
             self.rec = if self.rec > PASSIVE - 1 { PASSIVE - 9 } else { self.rec.saturating_sub(1) };
         }
         if !own || self.is_looped() {
@@ -248,6 +254,9 @@ impl Node for Controller {
         if !self.takes_part() {
             return;
         }
+        // An error-active controller's flag is dominant.
+        let is_active = matches!(self.state(), ErrorState::Active | ErrorState::Warning);
+        self.driven += u64::from(is_active && self.mode() == Some(Mode::Normal));
         self.count_error(kind, own);
         if own {
             self.sending = false;

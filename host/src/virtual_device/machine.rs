@@ -12,8 +12,9 @@ use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::session::Session;
 use cantap_wire::{CHANNELS, Channel};
 
-use super::board::{Filters, ModelClock, VirtualBoard, VirtualChip, VirtualPort};
+use super::board::{Ending, Filters, ModelClock, VirtualBoard, VirtualChip, VirtualPort};
 use super::controller::{ControlSide, Controller, TrafficSide};
+use super::flash::Flash;
 use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
 
@@ -25,6 +26,7 @@ const USB_POLLS_PER_MS: u32 = 4;
 #[derive(Debug, Default)]
 pub struct Witness {
     heard: [AtomicU64; CHANNELS],
+    driven: [AtomicU64; CHANNELS],
 }
 
 /// See [`Witness`].
@@ -32,12 +34,43 @@ pub struct Witness {
 pub struct Heard {
     /// Frames that ended well on each channel's bus while it was open and that its filters let pass.
     pub frames: [u64; CHANNELS],
+    /// Times that each channel's controller put a dominant level on its bus: frames that it began to send, acknowledged, or
+    /// destroyed by an error flag.
+    pub driven: [u64; CHANNELS],
 }
 
 impl Witness {
     /// The counts now.
     pub fn heard(&self) -> Heard {
-        Heard { frames: [0, 1].map(|channel: usize| self.heard[channel].load(Ordering::Acquire)) }
+        let read =
+            |counts: &[AtomicU64; CHANNELS]| counts.each_ref().map(|count| count.load(Ordering::Acquire));
+        Heard { frames: read(&self.heard), driven: read(&self.driven) }
+    }
+}
+
+/// What outlives the firmware.
+pub struct World {
+    port: VirtualPort,
+    buses: [SimBus; CHANNELS],
+    loops: [SimBus; CHANNELS],
+    joined: bool,
+    witness: Arc<Witness>,
+    flash: Flash,
+    now_ns: u64,
+}
+
+impl World {
+    pub fn new(options: &mut Options, port: VirtualPort, witness: Arc<Witness>) -> Self {
+        let silent = || SimBus::new(None, Traffic::new(Schedule::Silent), 0);
+        Self {
+            port,
+            buses: [options.bus(0), options.bus(1)],
+            loops: [silent(), silent()],
+            joined: options.joined,
+            witness,
+            flash: Flash::new(options.settings.clone()),
+            now_ns: 0,
+        }
     }
 }
 
@@ -53,18 +86,17 @@ pub struct Machine<'q> {
     loops: [SimBus; CHANNELS],
     joined: bool,
     witness: Arc<Witness>,
+    /// What it told of earlier firmwares' controllers.
+    heard_before: Heard,
     now_ns: u64,
     next_usb_ns: u64,
     next_tick_ns: u64,
 }
 
 impl<'q> Machine<'q> {
-    pub fn new(
-        queue: &'q RecordQueue,
-        options: &mut Options,
-        port: VirtualPort,
-        witness: Arc<Witness>,
-    ) -> Self {
+    /// The firmware starts, with an empty queue and nothing open.
+    pub fn power_up(queue: &'q RecordQueue, world: World) -> Self {
+        let World { port, buses, loops, joined, witness, flash, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
         let (producer, consumer) = queue.split();
         let identity = Identity {
@@ -73,27 +105,35 @@ impl<'q> Machine<'q> {
             serial: heapless::String::try_from("VIRTUAL").unwrap_or_default(),
         };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
-        let silent = || SimBus::new(None, Traffic::new(Schedule::Silent), 0);
         Self {
             board: VirtualBoard {
                 capture: Capture::new(producer),
                 traffic: [TrafficSide(side(0)), TrafficSide(side(1))],
                 control: [ControlSide(side(0)), ControlSide(side(1))],
-                clock: ModelClock::default(),
+                clock: ModelClock::started_at(now_ns),
                 filters: Filters([side(0), side(1)]),
-                chip: VirtualChip::default(),
+                chip: VirtualChip { flash, ending: None },
             },
             session: Session::new(consumer, identity),
             port,
-            buses: [options.bus(0), options.bus(1)],
-            loops: [silent(), silent()],
-            joined: options.joined,
+            buses,
+            loops,
+            joined,
             controllers,
+            heard_before: witness.heard(),
             witness,
-            now_ns: 0,
-            next_usb_ns: 0,
-            next_tick_ns: MS_NS,
+            now_ns,
+            next_usb_ns: now_ns,
+            next_tick_ns: now_ns + MS_NS,
         }
+    }
+
+    /// The firmware is gone; buses, port and flash remain.
+    pub fn power_down(self) -> World {
+        let Self { board, port, buses, loops, joined, witness, now_ns, .. } = self;
+        // What it had not read is lost with it.
+        while port.from_host.take(&mut [0; 64]) > 0 {}
+        World { port, buses, loops, joined, witness, flash: board.chip.flash, now_ns }
     }
 
     pub const fn now_ns(&self) -> u64 {
@@ -104,9 +144,9 @@ impl<'q> Machine<'q> {
         &self.port
     }
 
-    /// Whether the firmware asked to be restarted.
-    pub const fn wants_restart(&self) -> bool {
-        self.board.chip.restarts
+    /// Whether, and how, the firmware has ended.
+    pub const fn ending(&self) -> Option<Ending> {
+        self.board.chip.ending
     }
 
     /// Lets model time pass up to `until_ns`.
@@ -156,16 +196,17 @@ impl<'q> Machine<'q> {
 
     /// Serves the interrupts that controllers ask for, at once.
     fn interrupt(&mut self) {
-        let Self { board, controllers, witness, .. } = self;
+        let Self { board, controllers, witness, heard_before, .. } = self;
         for channel in Channel::ALL {
             let index = channel.index();
-            let (interrupts, heard) = {
+            let (interrupts, heard, driven) = {
                 let mut controller = controllers[index].borrow_mut();
-                (std::mem::take(&mut controller.interrupts), controller.heard)
+                (std::mem::take(&mut controller.interrupts), controller.heard, controller.driven)
             };
+            witness.driven[index].store(heard_before.driven[index] + driven, Ordering::Release);
             let entered = board.clock.now();
             if interrupts.receive {
-                witness.heard[index].store(heard, Ordering::Release);
+                witness.heard[index].store(heard_before.frames[index] + heard, Ordering::Release);
                 board.capture.on_receive(channel, &mut board.traffic[index], &board.clock, entered);
             }
             if interrupts.transmit {

@@ -11,6 +11,7 @@
 mod board;
 mod check;
 mod controller;
+mod flash;
 mod log;
 mod machine;
 mod options;

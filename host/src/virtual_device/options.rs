@@ -1,7 +1,7 @@
 //! What the virtual device is told after `virtual:`.
 
 use std::fmt::Display;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::time::Duration;
 
@@ -24,8 +24,8 @@ pub enum Pace {
 ///
 /// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `load` (per cent), `frames` (`std0` `std8` `ext0`
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
-/// in a burst, and its period), `errors` (per cent of the frames destroyed), `ack` (`yes`, `no`), `seed`, `pace`
-/// (`real`, `fast`), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `channels` (`1`, `2` or `both`:
+/// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (so many of the frames that the device
+/// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device saves), `pace` (`real`, `fast`), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `channels` (`1`, `2` or `both`:
 /// those with traffic), and at the end `log=FILE` (a trace file, replayed at its own times).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
@@ -39,8 +39,12 @@ pub struct Options {
     pub burst: Option<(u32, Duration)>,
     /// Share of the frames that are destroyed and sent again, in per cent.
     pub error_percent: f64,
+    /// Frames of the device that are destroyed on each bus, the first ones. 32 in a row make a channel bus-off.
+    pub disturb: u32,
     /// Whether the simulated nodes acknowledge.
     pub acknowledge: bool,
+    /// File that keeps what the device saves, as flash does over a power cycle.
+    pub settings: Option<PathBuf>,
     /// Makes another sequence of frames.
     pub seed: u64,
     /// How time passes.
@@ -61,7 +65,9 @@ impl Default for Options {
             bitrate_bps: None,
             burst: None,
             error_percent: 0.0,
+            disturb: 0,
             acknowledge: true,
+            settings: None,
             seed: 1,
             pace: Pace::RealTime,
             joined: false,
@@ -76,7 +82,7 @@ impl Default for Options {
 pub enum BadOption {
     /// There is no such key.
     #[error(
-        "there is no option '{0}'; there are load, frames, bitrate, burst, errors, ack, seed, pace, wire, channels, log"
+        "there is no option '{0}'; there are load, frames, bitrate, burst, errors, disturb, ack, seed, settings, pace, wire, channels, log"
     )]
     Unknown(String),
     /// The value does not fit.
@@ -142,6 +148,9 @@ impl Options {
                 self.burst = Some(burst.ok_or_else(|| bad(&"give frames and period, as in 10/960us"))?);
             }
             "ack" => self.acknowledge = choose(value, "yes", "no").ok_or_else(|| bad(&"give yes or no"))?,
+            "disturb" => self.disturb = value.parse().map_err(|_| bad(&"give a number of frames"))?,
+            "settings" if value.is_empty() => return Err(bad(&"give a file's name")),
+            "settings" => self.settings = Some(PathBuf::from(value)),
             "seed" => self.seed = value.parse().map_err(|_| bad(&"give a whole number"))?,
             "pace" => {
                 let real = choose(value, "real", "fast").ok_or_else(|| bad(&"give real or fast"))?;
@@ -183,6 +192,7 @@ impl Options {
         SimBus::new(self.bitrate_bps, Traffic::new(schedule), self.seed)
             .acknowledging(self.acknowledge)
             .with_errors(self.error_percent)
+            .disturbing(self.disturb)
     }
 }
 

@@ -9,13 +9,14 @@ use std::time::Duration;
 use serialport::{SerialPort, TTYPort};
 
 use super::options::Options;
-use super::runner::{VirtualDevice, start};
+use super::runner::{After, VirtualDevice, start_with};
 use crate::device::{DeviceError, PipeReader, PipeWriter};
 
 /// How often a terminal that nobody has open is looked at.
 const LOOK_EVERY: Duration = Duration::from_millis(10);
 
-/// A pseudo terminal with a virtual device behind it, until it is dropped.
+/// A pseudo terminal with a virtual device behind it, until it is dropped. A reset starts its firmware
+/// again behind the same path; the program that has it open finds no session any more.
 pub struct Terminal {
     path: String,
     quit: Arc<AtomicBool>,
@@ -27,6 +28,11 @@ impl Terminal {
     /// The path to open.
     pub fn path(&self) -> &str {
         &self.path
+    }
+
+    /// False once the firmware has left for the bootloader, which the virtual device does not have.
+    pub fn is_running(&self) -> bool {
+        self.device.as_ref().is_some_and(VirtualDevice::is_running)
     }
 }
 
@@ -42,7 +48,8 @@ pub fn open_terminal(options: Options) -> Result<Terminal, DeviceError> {
     drop(other);
     master.set_timeout(LOOK_EVERY).map_err(failed)?;
     let writer = master.try_clone_native().map_err(failed)?;
-    let connection = start(options)?;
+    // A board's port comes back under the same name.
+    let connection = start_with(options, After::Restart)?;
     connection.open.store(false, Ordering::Relaxed);
     let quit = Arc::new(AtomicBool::new(false));
     let (open, to_device, from_device) = (connection.open, connection.writer, connection.reader);

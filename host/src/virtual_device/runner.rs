@@ -7,8 +7,8 @@ use std::time::{Duration, Instant};
 
 use cantap_firmware::queue::RecordQueue;
 
-use super::board::VirtualPort;
-use super::machine::{Machine, Witness};
+use super::board::{Ending, VirtualPort};
+use super::machine::{Machine, Witness, World};
 use super::options::{Options, Pace};
 use crate::device::{DeviceError, Link, PipeReader, PipeWriter, pipe};
 
@@ -54,8 +54,21 @@ impl Connection {
     }
 }
 
-/// Starts a virtual device.
+/// What a reset of the firmware is to the host.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum After {
+    /// The port vanishes, as it does when a board enumerates again; whoever opens a virtual device anew gets another one.
+    Vanish,
+    /// The firmware starts again behind the same port.
+    Restart,
+}
+
+/// Starts a virtual device. Its port vanishes when the firmware is reset.
 pub fn start(options: Options) -> Result<Connection, DeviceError> {
+    start_with(options, After::Vanish)
+}
+
+pub(super) fn start_with(options: Options, after: After) -> Result<Connection, DeviceError> {
     let (reader, to_host) = pipe(TO_HOST_BYTES);
     let (from_host, writer) = pipe(FROM_HOST_BYTES);
     let (quit, open) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicBool::new(true)));
@@ -64,10 +77,17 @@ pub fn start(options: Options) -> Result<Connection, DeviceError> {
     let (for_thread, seen) = (Arc::clone(&quit), Arc::clone(&witness));
     let thread = std::thread::Builder::new()
         .name("cantap-virtual".to_owned())
-        .spawn(move || run(options, port, seen, &for_thread))
+        .spawn(move || run(options, port, seen, after, &for_thread))
         .map_err(DeviceError::Thread)?;
     let device = VirtualDevice { quit, thread: Some(thread) };
     Ok(Connection { reader, writer, witness, device, open })
+}
+
+impl VirtualDevice {
+    /// Whether the device is still there.
+    pub fn is_running(&self) -> bool {
+        self.thread.as_ref().is_some_and(|thread| !thread.is_finished())
+    }
 }
 
 impl Drop for VirtualDevice {
@@ -79,22 +99,29 @@ impl Drop for VirtualDevice {
     }
 }
 
-fn run(mut options: Options, port: VirtualPort, witness: Arc<Witness>, quit: &AtomicBool) {
-    let queue = Box::new(RecordQueue::new());
+fn run(mut options: Options, port: VirtualPort, witness: Arc<Witness>, after: After, quit: &AtomicBool) {
     let pace = options.pace;
-    let mut machine = Machine::new(&queue, &mut options, port, witness);
-    let is_over = |machine: &Machine<'_>| {
-        quit.load(Ordering::Relaxed) || machine.wants_restart() || machine.port().to_host.is_closed()
-    };
-    match pace {
-        Pace::RealTime => follow_the_wall_clock(&mut machine, is_over),
-        Pace::Fast => follow_the_host(&mut machine, is_over),
+    let mut world = World::new(&mut options, port, witness);
+    loop {
+        let queue = Box::new(RecordQueue::new());
+        let mut machine = Machine::power_up(&queue, world);
+        let is_over = |machine: &Machine<'_>| {
+            quit.load(Ordering::Relaxed) || machine.ending().is_some() || machine.port().to_host.is_closed()
+        };
+        match pace {
+            Pace::RealTime => follow_the_wall_clock(&mut machine, is_over),
+            Pace::Fast => follow_the_host(&mut machine, is_over),
+        }
+        if after == After::Vanish || machine.ending() != Some(Ending::Restart) {
+            return;
+        }
+        world = machine.power_down();
     }
 }
 
 /// Model time is wall time, seen in steps.
 fn follow_the_wall_clock(machine: &mut Machine<'_>, is_over: impl Fn(&Machine<'_>) -> bool) {
-    let started = Instant::now();
+    let (started, started_ns) = (Instant::now(), machine.now_ns());
     let mut slept_at = started;
     // Time in which the host could not read because this thread, and so perhaps the host too, was held up.
     let mut owed = Duration::ZERO;
@@ -103,7 +130,8 @@ fn follow_the_wall_clock(machine: &mut Machine<'_>, is_over: impl Fn(&Machine<'_
         if late > HELD_UP {
             owed = (owed + late).min(MAX_OWED);
         }
-        while let Some(behind) = started.elapsed().checked_sub(Duration::from_nanos(machine.now_ns()))
+        while let Some(behind) =
+            started.elapsed().checked_sub(Duration::from_nanos(machine.now_ns() - started_ns))
             && behind >= STEP
         {
             if machine.port().to_host.room() < LITTLE_ROOM && !owed.is_zero() {

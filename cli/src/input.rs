@@ -5,7 +5,7 @@ use std::path::Path;
 use anyhow::bail;
 use cantap::TraceRecord;
 use cantap::filter::Filter;
-use cantap::formats::{Format, ReadOptions, TraceReader, open_reader};
+use cantap::formats::{Format, LeftOut, ReadOptions, TraceReader, open_reader};
 
 use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
@@ -103,6 +103,14 @@ impl Records {
         }
     }
 
+    /// What else there is to know about a file so far, and how often.
+    pub fn notes(&self) -> LeftOut {
+        match &self.source {
+            Source::File(reader, _) => reader.notes().clone(),
+            Source::Device(_) => LeftOut::default(),
+        }
+    }
+
     /// Puts the next records that pass the filters in the place of what is in `records`, which may be none; false at the
     /// end. With `--strict`, an issue is an error.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
@@ -145,6 +153,9 @@ fn batch_of_file(
             Some(Err(issue)) if reader.issues() <= ISSUES_SHOWN => eprintln!("cantap: {issue}"),
             Some(Err(_)) => {}
         }
+    }
+    for (what, count) in reader.notes().iter() {
+        eprintln!("cantap: note: {what} ({count})");
     }
     match reader.issues() {
         0 => {}

@@ -96,6 +96,29 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table() {
     let path = directory.join("full.csv");
     assert!(write(&path, Format::Csv(CsvDialect::Full), &records).is_empty());
     assert_eq!(read(&path), (records.to_vec(), Vec::new()));
+    // The others say what they leave out.
+    for format in Format::all().filter(|format| *format != Format::Csv(CsvDialect::Full)) {
+        let left_out = write(&directory.join(file_name(format, "")), format, &records);
+        let late: Vec<_> = left_out.iter().filter(|(what, _)| what.contains("upper bounds")).collect();
+        assert!(matches!(late[..], [(_, 3)]), "{format}: {left_out:?}");
+    }
+}
+
+/// What Vector's programs write before a frame is sent is counted and named, and no frame.
+#[test]
+fn requests_to_send_are_passed_over_and_counted() {
+    let path = directory("requests").join("requests.asc");
+    let rows = "1.0 1 123 TxRq d 1 11\n1.001 1 123 Tx d 1 11\n1.5 1 123 TxRq d 1 22\n1.501 1 123 Tx d 1 22\n";
+    std::fs::write(
+        &path,
+        format!("date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\n{rows}"),
+    )
+    .unwrap();
+    let mut reader = cantap::formats::open_reader(&path, &cantap::formats::ReadOptions::default()).unwrap();
+    assert_eq!(reader.by_ref().map(Result::unwrap).count(), 2);
+    let notes: Vec<_> =
+        reader.notes().iter().map(|(what, count)| (what.contains("requests to send"), count)).collect();
+    assert_eq!(notes, [(true, 2)]);
 }
 
 /// Reading finds out by itself which spreadsheet a table was written for.

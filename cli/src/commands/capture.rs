@@ -13,7 +13,7 @@ use cantap::trigger::{Trigger, TriggerCounts};
 use cantap::wire::message::Mode;
 use cantap::{Address, Channel, Device, TraceRecord};
 
-use super::convert::WriteArgs;
+use super::convert::{WriteArgs, report as report_left_out};
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::interrupt;
@@ -333,9 +333,7 @@ impl Sink {
         let Some(writer) = self.writer.take() else { return Ok(()) };
         match writer.finish() {
             Ok(left_out) => {
-                for (what, count) in left_out.iter() {
-                    eprintln!("cantap: the format of '{}' cannot carry {count} {what}", self.name);
-                }
+                report_left_out(&left_out, Path::new(&self.name));
                 Ok(())
             }
             Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => Ok(()),

@@ -6,7 +6,7 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cantap::filter::Filter;
 use cantap::formats::{
-    DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, create_writer,
+    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, create_writer,
 };
 use cantap::window::{TimePoint, Window};
 
@@ -120,7 +120,7 @@ pub fn shown(path: &Path) -> String {
 }
 
 /// Says what a finished file could not carry.
-pub fn report(left_out: &cantap::formats::LeftOut, path: &Path) {
+pub fn report(left_out: &LeftOut, path: &Path) {
     for (what, count) in left_out.iter() {
         eprintln!("cantap: {} does not carry {what} ({count})", shown(path));
     }
@@ -164,12 +164,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     report(&left_out, &args.output);
     read?;
     if args.json {
-        let left_out: serde_json::Map<_, _> =
-            left_out.iter().map(|(what, count)| (what.to_owned(), count.into())).collect();
+        let object = |counts: &LeftOut| -> serde_json::Map<_, _> {
+            counts.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
+        };
         let summary = serde_json::json!({
             "records": written,
             "issues": records.issues(),
-            "left_out": left_out,
+            "notes": object(&records.notes()),
+            "left_out": object(&left_out),
         });
         if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }
     }

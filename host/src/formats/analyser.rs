@@ -340,12 +340,16 @@ impl RowDecoder {
         self.places[1..6].iter().all(Option::is_some)
     }
 
-    /// A line of CSV.
-    pub(crate) fn line(&self, line: &[u8]) -> Result<ReadRow, Fault> {
+    /// A line of CSV. Without its line end it must have all its cells.
+    pub(crate) fn line(&self, line: &[u8], terminated: bool) -> Result<ReadRow, Fault> {
         if matches!(line.first(), Some(b'#' | b'/')) {
             return Ok(None);
         }
         let cells: Vec<&[u8]> = line.split(|byte| *byte == self.separator).collect();
+        let last = self.places.iter().flatten().max().copied().unwrap_or(0);
+        if !terminated && cells.len() <= last {
+            return Err(Fault::malformed(format!("{} cells", last + 1), line));
+        }
         self.cells(&cells, line)
     }
 

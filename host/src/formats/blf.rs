@@ -14,6 +14,8 @@ pub(crate) use encode::Encoder;
 /// First bytes of a file, and its header's length.
 pub(crate) const FILE_MAGIC: &[u8; 4] = b"LOGG";
 const FILE_HEADER_BYTES: usize = 144;
+/// Where the header has the file's length.
+const FILE_BYTES_OFFSET: usize = 16;
 /// Where the header has the time of measurement start.
 const START_OFFSET: usize = 40;
 

@@ -24,6 +24,9 @@ pub(crate) struct Decoder {
     interfaces: Interfaces,
     /// A second event of the last line.
     pending: Option<TraceRecord>,
+    lengths: Lengths,
+    /// The last line looked whole and had no line end.
+    end_missing: bool,
     /// The last second's digits and time: most lines are in the same second as the one before.
     second: [u8; 10],
     second_ns: i64,
@@ -40,12 +43,20 @@ impl Decode for Decoder {
                 continue;
             }
             return Ok(match self.parse(text) {
+                Ok((record, _)) if !line.terminated && self.was_cut(line.text, &record) => line.cut(),
                 Ok((record, second)) => {
+                    self.end_missing = !line.terminated;
+                    if let Some(frame) = record.frame().filter(|frame| !frame.is_remote()) {
+                        self.lengths.note(frame);
+                    }
                     self.pending = second.map(|event| TraceRecord { event, ..record });
                     Found::Record(record)
                 }
                 Err(fault) => line.issue(fault),
             });
+        }
+        if std::mem::take(&mut self.end_missing) {
+            return Ok(Found::Note("the last line has no end: it may have been longer"));
         }
         Ok(Found::End)
     }
@@ -119,8 +130,20 @@ impl Decoder {
         // Only now: a line that is refused must not name an interface.
         let channel = self.interfaces.channel(interface);
         let frame = Frame::from_bus(id, false, len, data);
+        self.lengths.note(&frame);
         let event = TraceEvent::Frame { frame, direction, late: false };
         Some((TraceRecord { time_ns, channel, event }, text.len() - rest.len()))
+    }
+
+    /// Whether a line without its end, which reads as `record`, lost a part of it. A complete log may lack the last line
+    /// end, and a cut line may look whole: what counts is whether the identifier had longer frames before.
+    fn was_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        match record.frame() {
+            Some(frame) => {
+                line.ends_with(b" ") || !frame.is_remote() && self.lengths.of(frame.id()) > frame.dlc()
+            }
+            None => line.len() - line.iter().position(|byte| *byte == b'#').unwrap_or(0) <= 16,
+        }
     }
 
     /// One line's record, and a second event if it says two things.
@@ -160,6 +183,41 @@ impl Decoder {
         let frame = payload(id, data)?;
         let event = TraceEvent::Frame { frame, direction, late: false };
         Ok((TraceRecord { time_ns, channel, event }, None))
+    }
+}
+
+/// How long the last data frames of recent identifiers were.
+struct Lengths(Box<[(u32, u8); Self::PLACES]>);
+
+impl Lengths {
+    /// More identifiers than most buses have, and little enough for the processor's cache.
+    const PLACES: usize = 512;
+    const EXTENDED: u32 = 1 << 31;
+
+    #[inline]
+    fn key(id: Id) -> (usize, u32) {
+        let raw = id.raw();
+        let place = (raw ^ raw >> 9 ^ raw >> 18) as usize % Self::PLACES;
+        (place, raw | if id.is_extended() { Self::EXTENDED } else { 0 })
+    }
+
+    #[inline]
+    fn note(&mut self, frame: &Frame) {
+        let (place, key) = Self::key(frame.id());
+        self.0[place] = (key, frame.dlc());
+    }
+
+    /// 0 if it is not known.
+    fn of(&self, id: Id) -> u8 {
+        let (place, key) = Self::key(id);
+        let (known, len) = self.0[place];
+        if known == key { len } else { 0 }
+    }
+}
+
+impl Default for Lengths {
+    fn default() -> Self {
+        Self(Box::new([(0, 0); Self::PLACES]))
     }
 }
 
@@ -310,6 +368,30 @@ mod tests {
             let record = super::Decoder::default().plain(line.as_bytes()).map(|(record, _)| record);
             assert_eq!(record, tests::read(Format::Candump, line.as_str()).0.first().copied(), "{frame}");
             assert!(record.is_some(), "{frame}");
+        }
+    }
+
+    /// A complete log may lack its last line end; a cut line can look whole.
+    #[test]
+    fn a_last_line_without_its_end_counts_unless_the_identifier_had_longer_frames() {
+        let before = "(1.000000) can0 123#DEADBEEF\n(2.000000) can0 456#\n";
+        for (last, records, issues) in [
+            ("(3.000000) can0 123#DEADBEEF", 3, 0),
+            ("(3.000000) can0 123#DEAD", 2, 1),
+            ("(3.000000) can0 123#DEADB", 2, 1),
+            ("(3.000000) can0 456#DE", 3, 0),
+            ("(3.000000) can0 789#DE", 3, 0),
+            ("(3.000000) can0 123#R", 3, 0),
+            ("(3.000000) can0 123#DEADBEEF ", 2, 1),
+            ("(3.000000) can0 20000004#0001", 2, 1),
+            ("(3.000000) ca", 2, 1),
+        ] {
+            let (got, told) = tests::read(Format::Candump, format!("{before}{last}"));
+            assert_eq!((got.len(), told.len()), (records, issues), "{last}: {told:?}");
+            assert!(
+                told.iter().all(|issue| issue.contains("line 3: the file ends inside a line")),
+                "{told:?}"
+            );
         }
     }
 

@@ -58,8 +58,11 @@ impl Decode for Decoder {
                 None => self.head(text),
                 Some(CsvDialect::PythonCan) => python_can(text),
                 Some(CsvDialect::Full) => full(text).map(|record| Some((record, None))),
-                Some(CsvDialect::Analyser) => self.analyser.line(text),
+                Some(CsvDialect::Analyser) => self.analyser.line(text, line.terminated),
             };
+            if !line.terminated && self.may_be_cut(text, &result) {
+                return Ok(line.cut());
+            }
             match result {
                 Ok(Some((record, second))) => {
                     self.pending = second.map(|event| TraceRecord { event, ..record });
@@ -89,6 +92,17 @@ const MAX_COMMENTS: u32 = 100;
 pub(crate) type Row = Option<(TraceRecord, Option<TraceEvent>)>;
 
 impl Decoder {
+    /// Whether a last row that looks whole, and has no line end, may have lost the end of what it says.
+    fn may_be_cut(&self, row: &[u8], read: &Result<Row, Fault>) -> bool {
+        let Ok(Some((TraceRecord { event, .. }, _))) = read else { return false };
+        let is_frame = matches!(event, TraceEvent::Frame { .. });
+        match self.dialect {
+            Some(CsvDialect::Full) => !is_frame || !(row.ends_with(b",") || row.ends_with(b",late")),
+            Some(CsvDialect::PythonCan) => !is_frame && !row.ends_with(b"="),
+            Some(CsvDialect::Analyser) | None => false,
+        }
+    }
+
     fn head(&mut self, line: &[u8]) -> Result<Row, Fault> {
         if line == PYTHON_CAN_HEAD.as_bytes() {
             self.dialect = Some(CsvDialect::PythonCan);
@@ -320,6 +334,10 @@ impl FullEncoder {
 }
 
 impl Encode for FullEncoder {
+    fn carries_late(&self) -> bool {
+        true
+    }
+
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         self.start(out);
         push_time(out, record.time_ns);

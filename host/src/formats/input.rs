@@ -61,6 +61,11 @@ impl Line<'_> {
         };
         Found::Issue(Place::Line(self.number), fault)
     }
+
+    /// For the last line of a file, if it looks whole and yet may have lost its end.
+    pub(crate) fn cut(&self) -> Found {
+        Found::Issue(Place::Line(self.number), Fault::Truncated("a line"))
+    }
 }
 
 impl Input {

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
+use super::writer::LeftOut;
 use super::{Format, UnknownFormat, asc, blf, candump, csv, dif, pcapng, trc};
 use crate::TraceRecord;
 
@@ -37,9 +38,15 @@ pub(crate) enum Found {
     Record(TraceRecord),
     /// Something wrong; reading goes on behind it.
     Issue(Place, Fault),
+    /// Nothing wrong, but something that the user should know, to be counted.
+    Note(&'static str),
     /// The end.
     End,
 }
+
+/// Of the rows and objects that Vector's programs write before they send a frame.
+pub(crate) const REQUESTS_TO_SEND: &str =
+    "requests to send were passed over: what was sent is in the trace again as sent";
 
 /// The reading half of a format.
 pub(crate) trait Decode: Send {
@@ -83,6 +90,7 @@ pub struct TraceReader {
     after: Option<io::Result<Found>>,
     strict: bool,
     issues: u64,
+    notes: LeftOut,
     ended: bool,
 }
 
@@ -129,7 +137,19 @@ impl TraceReader {
             Format::Dif => Box::new(dif::Decoder::default()),
         };
         let batch = Vec::with_capacity(BATCH);
-        Self { name, format, input, decoder, batch, at: 0, after: None, strict, issues: 0, ended: false }
+        Self {
+            name,
+            format,
+            input,
+            decoder,
+            batch,
+            at: 0,
+            after: None,
+            strict,
+            issues: 0,
+            notes: LeftOut::default(),
+            ended: false,
+        }
     }
 
     /// Reads from any source of bytes, plain or compressed. `name` is what issues call it.
@@ -165,6 +185,12 @@ impl TraceReader {
         self.issues
     }
 
+    /// What is nothing wrong and should be known all the same, such as requests to send a frame that were passed over: so
+    /// far, and how often.
+    pub fn notes(&self) -> &LeftOut {
+        &self.notes
+    }
+
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));
@@ -185,6 +211,10 @@ impl TraceReader {
         match after {
             Ok(Found::Record(record)) => {
                 self.batch.push(record);
+                Beyond::Batch
+            }
+            Ok(Found::Note(what)) => {
+                self.notes.note(what);
                 Beyond::Batch
             }
             Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),

@@ -9,7 +9,7 @@ use super::csv::CsvDialect;
 use super::output::{Output, Patch};
 use super::rotate::{Rotating, Rotation};
 use super::{Format, analyser, asc, blf, candump, csv, dif, pcapng, trc};
-use crate::TraceRecord;
+use crate::{TraceEvent, TraceRecord};
 
 /// Bytes collected before they go to the system.
 const BUFFER_BYTES: usize = 128 * 1024;
@@ -25,7 +25,7 @@ pub struct WriteOptions {
     pub table: TableStyle,
 }
 
-/// What a file could not carry: a description and how often.
+/// What a file could not carry, or what there is to know about one: a description and how often.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub struct LeftOut(BTreeMap<&'static str, u64>);
 
@@ -75,6 +75,11 @@ pub trait TraceWriter: Send {
 pub(crate) trait Encode: Send {
     /// Appends a record, and before the first one the file's head.
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut);
+
+    /// Whether the format can say that a frame's time is only an upper bound.
+    fn carries_late(&self) -> bool {
+        false
+    }
 
     /// Appends what was held back, so that a file ending here is valid.
     fn flush(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
@@ -192,6 +197,9 @@ impl TraceWriter for FileWriter {
     #[inline]
     fn write(&mut self, record: &TraceRecord) -> io::Result<()> {
         self.has_records = true;
+        if matches!(record.event, TraceEvent::Frame { late: true, .. }) && !self.encoder.carries_late() {
+            self.left_out.note("the mark of times that are only upper bounds");
+        }
         self.encoder.record(record, &mut self.buffer, &mut self.left_out);
         if self.buffer.len() >= BUFFER_BYTES { self.drain() } else { Ok(()) }
     }

@@ -8,7 +8,7 @@ use super::super::calendar::{Date, MONTHS};
 use super::super::event_text;
 use super::super::input::Input;
 use super::super::issue::Fault;
-use super::super::reader::{Decode, Found};
+use super::super::reader::{Decode, Found, REQUESTS_TO_SEND};
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::STATES;
@@ -31,7 +31,16 @@ pub(crate) struct Decoder {
 /// What a line is.
 enum Content {
     Record(TraceRecord),
+    /// A request to send: if it gets through, a Tx line follows.
+    Request,
     /// Part of the file's head, or an event of no interest.
+    Other,
+}
+
+/// What a line on a classical channel is.
+enum Classical {
+    Event(TraceEvent),
+    Request,
     Other,
 }
 
@@ -40,12 +49,23 @@ fn begins(line: &[u8], word: &str) -> bool {
     line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes()))
 }
 
+/// Whether a line is empty or the end of a block, with which files end.
+fn is_footer(line: &[u8]) -> bool {
+    line.is_empty() || begins(line, "end triggerblock")
+}
+
 impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
             match self.line(text) {
+                Ok(Content::Record(record)) if !line.terminated && self.may_be_cut(text, &record) => {
+                    return Ok(line.cut());
+                }
                 Ok(Content::Record(record)) => return Ok(Found::Record(record)),
+                Ok(Content::Request) => return Ok(Found::Note(REQUESTS_TO_SEND)),
+                // The beginning of an event can look like one of no interest.
+                Ok(Content::Other) if !line.terminated && !is_footer(text) => return Ok(line.cut()),
                 Ok(Content::Other) => {}
                 Err(fault) => return Ok(line.issue(fault)),
             }
@@ -126,8 +146,11 @@ impl Decoder {
         let time_ns = self.time(offset_ns);
         let (first, rest) = text::word(rest);
         if let Some(channel) = channel(first) {
-            let event = self.classical(rest)?;
-            return Ok(event.map_or(Content::Other, |event| record(time_ns, channel, event)));
+            return Ok(match self.classical(rest)? {
+                Classical::Event(event) => record(time_ns, channel, event),
+                Classical::Request => Content::Request,
+                Classical::Other => Content::Other,
+            });
         }
         let (second, rest) = text::word(rest);
         let Some(channel) = channel(second) else { return Ok(Content::Other) };
@@ -141,18 +164,17 @@ impl Decoder {
 
     /// An event on a classical channel, behind the channel's number.
     #[inline]
-    fn classical(&self, rest: &[u8]) -> Result<Option<TraceEvent>, Fault> {
+    fn classical(&self, rest: &[u8]) -> Result<Classical, Fault> {
         let (id, rest) = text::word(rest);
         if id.eq_ignore_ascii_case(b"ErrorFrame") {
-            return Ok(Some(error_frame(rest)));
+            return Ok(Classical::Event(error_frame(rest)));
         }
-        let Some((raw, extended)) = self.identifier(id) else { return Ok(None) };
+        let Some((raw, extended)) = self.identifier(id) else { return Ok(Classical::Other) };
         let (word, rest) = text::word(rest);
         let direction = match word {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
-            // A request to send: if it gets through, a Tx line follows.
-            b"TxRq" => return Ok(None),
+            b"TxRq" => return Ok(Classical::Request),
             _ => return Err(Fault::malformed("'Rx' or 'Tx' behind the identifier", word)),
         };
         let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
@@ -174,7 +196,17 @@ impl Decoder {
             }
             other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
         };
-        Ok(Some(TraceEvent::Frame { frame, direction, late: false }))
+        Ok(Classical::Event(TraceEvent::Frame { frame, direction, late: false }))
+    }
+
+    /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
+    /// whose bytes are all there.
+    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        match record.frame() {
+            Some(frame) if frame.is_remote() => matches!(line.last(), Some(b'r' | b'R')),
+            Some(_) => self.decimal || memchr::memmem::find(line, b"CANFD").is_some(),
+            None => true,
+        }
     }
 
     /// An event on a CAN FD channel, which may be a classical frame.

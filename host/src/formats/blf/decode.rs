@@ -10,13 +10,13 @@ use super::super::calendar::Date;
 use super::super::event_text;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
-use super::super::reader::{Decode, Found};
+use super::super::reader::{Decode, Found, REQUESTS_TO_SEND};
 use super::super::sja1000;
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR, CAN_ERROR_EXT, CAN_FD_ERROR_64, CAN_FD_MESSAGE, CAN_FD_MESSAGE_64,
     CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES, DATA_LOST_END,
-    DIRECTION, EVENT_COMMENT, EXTENDED, FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE, LOG_CONTAINER,
-    OBJECT_MAGIC, OWN_MARK, REMOTE, REQUESTED, SENT, START_OFFSET, TIME_IN_TEN_US,
+    DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE,
+    LOG_CONTAINER, OBJECT_MAGIC, OWN_MARK, REMOTE, REQUESTED, SENT, START_OFFSET, TIME_IN_TEN_US,
 };
 use crate::{Direction, TraceEvent, TraceRecord};
 
@@ -34,6 +34,8 @@ pub(crate) const KINDS: [BusErrorKind; 6] = [
 pub(crate) struct Decoder {
     started: bool,
     start_ns: i64,
+    /// How long the header says that the file is.
+    file_bytes: u64,
     /// Decompressed objects; those before `at` are used up. One may go on in the next container.
     objects: Vec<u8>,
     at: usize,
@@ -51,6 +53,7 @@ impl Default for Decoder {
         Self {
             started: false,
             start_ns: 0,
+            file_bytes: 0,
             objects: Vec::new(),
             at: 0,
             decompressor: Decompress::new(true),
@@ -91,6 +94,7 @@ const EXPECTED_OBJECT: &str = "an object that begins with LOBJ";
 /// What came out of looking for an object.
 enum Object {
     Event(TraceRecord),
+    Request,
     Other,
     Issue(Fault),
     /// The rest is in the next container, if there is one.
@@ -112,6 +116,7 @@ impl Decode for Decoder {
         loop {
             match self.object() {
                 Object::Event(record) => return Ok(Found::Record(record)),
+                Object::Request => return Ok(Found::Note(REQUESTS_TO_SEND)),
                 Object::Other => {}
                 Object::Issue(fault) => return Ok(Found::Issue(Place::Offset(self.container), fault)),
                 Object::Incomplete => {
@@ -122,7 +127,7 @@ impl Decode for Decoder {
                         return Ok(Found::Issue(place, fault));
                     }
                     if !self.container(input)? {
-                        return Ok(self.end());
+                        return Ok(self.end(input.offset()));
                     }
                 }
             }
@@ -146,19 +151,26 @@ impl Decoder {
             return Ok(Some(Fault::malformed("a BLF file, which begins with LOGG", found)));
         }
         let len = u32_at(head, 4) as usize;
+        // A cut is told once.
+        self.file_bytes = if cut { 0 } else { u64_at(head, FILE_BYTES_OFFSET) };
         self.start_ns = system_time(&head[START_OFFSET.min(head.len())..]);
         input.consume(if (START_OFFSET..=4096).contains(&len) { len } else { FILE_HEADER_BYTES });
         Ok(cut.then_some(Fault::Truncated("the file header")))
     }
 
-    /// After the last container.
-    fn end(&mut self) -> Found {
+    /// After the last container, `offset` bytes into the file.
+    fn end(&mut self, offset: u64) -> Found {
         let rest = self.objects.len() - self.at;
         self.objects.clear();
         self.at = 0;
         // Up to three bytes may be padding.
         if rest > 3 {
+            self.file_bytes = 0;
             return Found::Issue(Place::Offset(self.container), Fault::Truncated("an object"));
+        }
+        // Cut between two containers.
+        if offset < std::mem::take(&mut self.file_bytes) {
+            return Found::Issue(Place::Offset(offset), Fault::Truncated("the length that its header tells"));
         }
         Found::End
     }
@@ -191,6 +203,7 @@ impl Decoder {
                 let rest = head.len();
                 input.consume(rest);
                 self.fault = Some((place, Fault::Truncated("an object's header")));
+                self.file_bytes = 0;
                 return Ok(true);
             }
             if !(BASE_HEADER_BYTES..=MAX_ITEM_BYTES).contains(&len) {
@@ -229,6 +242,7 @@ impl Decoder {
             }
             if cut {
                 fault = Some(Fault::Truncated("an object"));
+                self.file_bytes = 0;
             }
             let used = object.len();
             input.consume(used);
@@ -267,11 +281,12 @@ impl Decoder {
         let time_ns = self.start_ns.saturating_add(offset_ns);
         let told = std::mem::take(&mut self.loss_told);
         match event(kind, &object[header_len..], told) {
-            Ok(Some((channel, event))) => {
+            Ok(Content::Event(channel, event)) => {
                 self.loss_told = kind == EVENT_COMMENT && matches!(event, TraceEvent::Lost { .. });
                 Object::Event(TraceRecord { time_ns, channel, event })
             }
-            Ok(None) => Object::Other,
+            Ok(Content::Request) => Object::Request,
+            Ok(Content::Other) => Object::Other,
             Err(fault) => Object::Issue(fault),
         }
     }
@@ -350,9 +365,18 @@ fn inflate(decompressor: &mut Decompress, mut data: &[u8], expected_len: usize, 
     }
 }
 
-/// The channel and event of an object's fields; `None` for those of no interest.
+/// What an object's fields say.
+enum Content {
+    /// A channel and what happened there.
+    Event(u8, TraceEvent),
+    /// The mere request to send a frame.
+    Request,
+    /// Something of no interest.
+    Other,
+}
+
 #[inline]
-fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceEvent)>, Fault> {
+fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content, Fault> {
     let need = |len: usize| {
         let found = fields.len();
         if found >= len {
@@ -363,10 +387,13 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceE
     };
     let channel = u8::try_from(u16_at(fields, 0)).unwrap_or(u8::MAX);
     let unknown_error = TraceEvent::BusError { kind: None, counters: None };
+    let on = |channel| {
+        move |event: Option<_>| event.map_or(Content::Request, |event| Content::Event(channel, event))
+    };
     Ok(match kind {
         CAN_MESSAGE | CAN_MESSAGE2 => {
             need(16)?;
-            frame(fields[2], fields[3], u32_at(fields, 4), &fields[8..16])?.map(|event| (channel, event))
+            frame(fields[2], fields[3], u32_at(fields, 4), &fields[8..16]).map(on(channel))?
         }
         CAN_FD_MESSAGE => {
             const FD_FORMAT: u8 = 1;
@@ -374,7 +401,7 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceE
             if fields[13] & FD_FORMAT != 0 {
                 return Err(Fault::Unsupported("a CAN FD frame".into()));
             }
-            frame(fields[2], fields[3], u32_at(fields, 4), &fields[20..28])?.map(|event| (channel, event))
+            frame(fields[2], fields[3], u32_at(fields, 4), &fields[20..28]).map(on(channel))?
         }
         CAN_FD_MESSAGE_64 => {
             const FD_REMOTE: u32 = 1 << 4;
@@ -390,19 +417,19 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceE
             let present = fields[40..].len().min(usize::from(fields[2])).min(8);
             data[..present].copy_from_slice(&fields[40..40 + present]);
             let direction = fields[34] & DIRECTION;
-            frame(remote | direction, fields[1], u32_at(fields, 4), &data)?.map(|event| (fields[0], event))
+            frame(remote | direction, fields[1], u32_at(fields, 4), &data).map(on(fields[0]))?
         }
-        CAN_ERROR => Some((channel, unknown_error)),
-        CAN_FD_ERROR_64 => Some((fields.first().copied().unwrap_or_default(), unknown_error)),
+        CAN_ERROR => Content::Event(channel, unknown_error),
+        CAN_FD_ERROR_64 => Content::Event(fields.first().copied().unwrap_or_default(), unknown_error),
         CAN_ERROR_EXT => {
             need(32)?;
-            Some((channel, error_ext(fields)))
+            Content::Event(channel, error_ext(fields))
         }
         DATA_LOST_END if !loss_told => {
             need(16)?;
             let count = u32_at(fields, 12);
             let lost = TraceEvent::Lost { stage: None, count: count.max(1), at_least: count == 0 };
-            Some((1, lost))
+            Content::Event(1, lost)
         }
         EVENT_COMMENT => {
             let len = u32_at(fields, 4) as usize;
@@ -412,9 +439,10 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Option<(u8, TraceE
                 let (number, _) = super::super::text::word(rest);
                 u8::try_from(super::super::text::decimal(number)?).ok()
             });
-            channel.zip(event_text::marked(text))
+            let event = channel.zip(event_text::marked(text));
+            event.map_or(Content::Other, |(channel, event)| Content::Event(channel, event))
         }
-        _ => None,
+        _ => Content::Other,
     })
 }
 

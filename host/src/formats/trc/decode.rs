@@ -94,6 +94,13 @@ impl Decode for Decoder {
                 _ => self.row(text),
             };
             match result {
+                Ok(row)
+                    if !line.terminated
+                        && !matches!(text, [] | [b';', ..])
+                        && !row.is_some_and(|record| self.is_sure(&record)) =>
+                {
+                    return Ok(line.cut());
+                }
                 Ok(Some(record)) => return Ok(Found::Record(record)),
                 Ok(None) => {}
                 Err(fault) => return Ok(line.issue(fault)),
@@ -104,6 +111,13 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
+    /// Whether a row without its line end lost nothing. Nobody can tell what an event's row lost, and in version 1 whether
+    /// RTR would have followed a length of 0; any other frame that lost something is an error.
+    fn is_sure(&self, record: &TraceRecord) -> bool {
+        let v1 = self.version < TrcVersion::V2_0;
+        record.frame().is_some_and(|frame| frame.dlc() > 0 || frame.is_remote() || !v1)
+    }
+
     /// A line of the head, without the semicolon.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         let value = |name: &[u8]| line.strip_prefix(name).map(<[u8]>::trim_ascii);

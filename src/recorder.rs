@@ -58,7 +58,9 @@ impl<'q, const N: usize> Recorder<'q, N> {
         }
         let index = received.channel.index();
         let difference = self.difference(at);
-        if self.producer.push(Kind::Frame, |room| encode_received(received, difference, room)) {
+        // Room that the reader made since a moment ago is for the loss record: it stands before the next frame.
+        let in_turn = self.unreported == [0; CHANNELS];
+        if in_turn && self.producer.push(Kind::Frame, |room| encode_received(received, difference, room)) {
             if received.stamp != cantap_wire::Stamp::Omitted {
                 self.last_ticks = at;
             }

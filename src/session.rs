@@ -3,7 +3,7 @@
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
 //! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
 
-use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, seal, unseal};
+use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{DeviceMessage, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request, Response};
 
@@ -271,8 +271,6 @@ fn encode_response(response: Response, out: &mut [u8]) -> usize {
     let Some((end, out)) = out.split_first_mut() else { return 0 };
     *end = 0;
     let mut message = [0; MAX_RESPONSE + CRC_LEN];
-    let written = postcard::to_slice(&DeviceMessage::Response(response), &mut message[..MAX_RESPONSE]);
     // Cannot fail: every response is shorter (tested).
-    let len = written.map_or(0, |written| written.len());
-    1 + seal(&mut message, len, out).unwrap_or(0)
+    1 + framing::encode(&DeviceMessage::Response(response), &mut message, out).unwrap_or(0)
 }

@@ -21,11 +21,20 @@ fn numbered(number: u32) -> Received {
     }
 }
 
+/// Sets its flag when it goes, also by a panic.
+struct Gone<'a>(&'a AtomicBool);
+
+impl Drop for Gone<'_> {
+    fn drop(&mut self) {
+        self.0.store(true, Ordering::Release);
+    }
+}
+
 /// Reads everything as USB does and checks it: each frame is there or counted, in order. Returns the frames read.
 fn check(pace: impl Fn(u32)) -> u32 {
     let queue = RecordQueue::<{ 16 * 1024 }>::new();
     let (producer, mut consumer) = queue.split();
-    let done = AtomicBool::new(false);
+    let (done, reader_gone) = (AtomicBool::new(false), AtomicBool::new(false));
     let (mut read, mut lost) = (0, [0u32; 2]);
     std::thread::scope(|scope| {
         scope.spawn(|| {
@@ -33,12 +42,13 @@ fn check(pace: impl Fn(u32)) -> u32 {
             for number in 0..FRAMES {
                 recorder.frame(&numbered(number), u64::from(number) * 576);
             }
-            while recorder.fill().0 > 0 {
+            while recorder.fill().0 > 0 && !reader_gone.load(Ordering::Acquire) {
                 std::thread::yield_now();
             }
             recorder.flush_losses(u64::from(FRAMES) * 576);
             done.store(true, Ordering::Release);
         });
+        let _gone = Gone(&reader_gone);
         let mut next = [0, 1];
         let mut time = 0i64;
         loop {

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use cantap::device::{Link, PipeReader, PipeWriter, pipe};
 use cantap::wire::batch::BatchWriter;
-use cantap::wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal, unseal};
+use cantap::wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE, unseal};
 use cantap::wire::message::{ChannelStatus, DeviceMessage, Status};
 use cantap::wire::record::{ErrorState, LossStage, MAX_RECORD, encode_event, encode_received};
 use cantap::wire::{
@@ -100,9 +100,8 @@ impl FakeDevice {
     fn answer(&mut self, id: u16, result: Result<Reply, Refusal>) {
         let mut message = [0; MAX_MESSAGE + CRC_LEN];
         let response = DeviceMessage::Response(Response { id, result });
-        let len = postcard::to_slice(&response, &mut message).unwrap().len();
         let mut out = [0; MAX_ENCODED];
-        let len = seal(&mut message, len, &mut out).unwrap();
+        let len = framing::encode(&response, &mut message, &mut out).unwrap();
         self.output.write_all(&out[..len]).unwrap();
     }
 

@@ -12,7 +12,7 @@ use cantap_firmware::ports::{
 };
 use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::session::Session;
-use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
+use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{
@@ -448,9 +448,8 @@ impl<'q, const N: usize> Bench<'q, N> {
 /// A request on the wire.
 pub fn encode(request: &Request) -> Vec<u8> {
     let mut message = [0; MAX_MESSAGE + CRC_LEN];
-    let len = postcard::to_slice(request, &mut message).unwrap().len();
     let mut out = [0; MAX_ENCODED];
-    let len = seal(&mut message, len, &mut out).unwrap();
+    let len = framing::encode(request, &mut message, &mut out).unwrap();
     out[..len].to_vec()
 }
 

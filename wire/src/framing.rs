@@ -4,6 +4,7 @@
 //! is what proves it.
 
 use crc::Crc;
+use serde::Serialize;
 
 /// Largest message before CRC and COBS, in bytes, in either direction.
 pub const MAX_MESSAGE: usize = 2048;
@@ -47,6 +48,14 @@ pub enum FramingError {
     Short,
     /// The CRC does not match.
     Crc,
+}
+
+/// Writes `message` to `out` as it goes over the wire and returns the length. `buffer` is room for the message and its CRC.
+/// `None` if either is too short.
+pub fn encode(message: &impl Serialize, buffer: &mut [u8], out: &mut [u8]) -> Option<usize> {
+    let room = buffer.len().checked_sub(CRC_LEN)?;
+    let len = postcard::to_slice(message, &mut buffer[..room]).ok()?.len();
+    seal(buffer, len, out)
 }
 
 /// Encodes the first `len` bytes of `message` into `out` and returns the encoded length, zero byte

@@ -1,7 +1,7 @@
 //! The worked example of `docs/wire-protocol.md`, byte for byte.
 
 use cantap_wire::batch::BatchWriter;
-use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, seal};
+use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::record::{LossStage, MAX_RECORD, encode_event, encode_received};
 use cantap_wire::{Channel, Command, Decoded, Decoder, Event, Received, Record, Request, Stamp};
 
@@ -18,9 +18,8 @@ fn documented(heading: &str) -> Vec<u8> {
 fn the_request_is_what_the_document_says() {
     let mut message = [0; MAX_MESSAGE + CRC_LEN];
     let request = Request { id: 1, command: Command::Hello { protocol: 2 } };
-    let len = postcard::to_slice(&request, &mut message).unwrap().len();
     let mut out = [0; MAX_ENCODED];
-    let len = seal(&mut message, len, &mut out).unwrap();
+    let len = framing::encode(&request, &mut message, &mut out).unwrap();
     assert_eq!(out[..len], documented("### The request"), "{:02x?}", &out[..len]);
 }
 

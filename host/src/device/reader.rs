@@ -8,7 +8,7 @@ use std::sync::mpsc::{Receiver, SyncSender};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, seal};
+use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len};
 use cantap_wire::record::LossStage;
 use cantap_wire::{CHANNELS, Channel, Command, Reply, Request, Response};
 
@@ -175,11 +175,8 @@ impl Shared {
 /// A request as it goes over the wire.
 pub(super) fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
     let mut message = [0; MAX_REQUEST + CRC_LEN];
-    let len = postcard::to_slice(request, &mut message[..MAX_REQUEST])
-        .map_err(|_| DeviceError::RequestTooLong)?
-        .len();
-    let mut out = vec![0; max_encoded_len(len)];
-    let encoded = seal(&mut message, len, &mut out).ok_or(DeviceError::RequestTooLong)?;
+    let mut out = vec![0; max_encoded_len(MAX_REQUEST)];
+    let encoded = framing::encode(request, &mut message, &mut out).ok_or(DeviceError::RequestTooLong)?;
     out.truncate(encoded);
     Ok(out)
 }

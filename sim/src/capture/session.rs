@@ -1,6 +1,6 @@
 //! One side of the conversation: requests out, responses and records in. No I/O and no time.
 
-use cantap_wire::framing::{CRC_LEN, MAX_MESSAGE, max_encoded_len, seal};
+use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::Response;
 use cantap_wire::{CHANNELS, Command, Corruption, Decoded, Decoder, PROTOCOL_VERSION, Record, Request};
 
@@ -34,10 +34,9 @@ impl Session {
         let id = self.next_id;
         self.next_id = self.next_id.wrapping_add(1);
         let mut message = [0; MAX_MESSAGE + CRC_LEN];
+        let mut out = vec![0; 1 + MAX_ENCODED];
         // Cannot fail: every command is shorter than the longest message, and the buffers fit it.
-        let len = postcard::to_slice(&Request { id, command }, &mut message).map_or(0, |bytes| bytes.len());
-        let mut out = vec![0; 1 + max_encoded_len(len)];
-        let encoded = seal(&mut message, len, &mut out[1..]).unwrap_or(0);
+        let encoded = framing::encode(&Request { id, command }, &mut message, &mut out[1..]).unwrap_or(0);
         out.truncate(1 + encoded);
         (id, out)
     }

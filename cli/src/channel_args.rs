@@ -12,7 +12,7 @@ use crate::timing_args::TimingArgs;
 const VIRTUAL_BITRATE_BPS: u32 = 500_000;
 
 /// How to open a channel; for commands to flatten into theirs.
-#[derive(clap::Args, Clone)]
+#[derive(clap::Args, Clone, Debug, Default)]
 pub struct ChannelArgs {
     #[command(flatten)]
     pub timing: TimingArgs,
@@ -62,6 +62,26 @@ struct Plan {
 }
 
 impl ChannelArgs {
+    /// The mode that was asked for, if one was.
+    pub fn mode(&self) -> Option<Mode> {
+        Some(match self.mode? {
+            ModeArg::Listen => Mode::ListenOnly,
+            ModeArg::Normal => Mode::Normal,
+            ModeArg::Loopback => Mode::Loopback,
+            ModeArg::SilentLoopback => Mode::SilentLoopback,
+        })
+    }
+
+    /// Asks for another mode.
+    pub fn set_mode(&mut self, mode: Mode) {
+        self.mode = Some(match mode {
+            Mode::ListenOnly => ModeArg::Listen,
+            Mode::Normal => ModeArg::Normal,
+            Mode::Loopback => ModeArg::Loopback,
+            Mode::SilentLoopback => ModeArg::SilentLoopback,
+        });
+    }
+
     /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before
     /// the first is opened. Commands that receive give their filters; with none of them, those saved on the device count.
     /// Says on standard error which filters the hardware could not take, and that saved ones count.
@@ -148,15 +168,8 @@ impl ChannelArgs {
                 ),
             },
         };
-        let mode = match self.mode {
-            None => mode.unwrap_or(base.mode),
-            Some(ModeArg::Listen) => Mode::ListenOnly,
-            Some(ModeArg::Normal) => Mode::Normal,
-            Some(ModeArg::Loopback) => Mode::Loopback,
-            Some(ModeArg::SilentLoopback) => Mode::SilentLoopback,
-        };
         let config = ChannelConfig {
-            mode,
+            mode: self.mode().or(mode).unwrap_or(base.mode),
             one_shot: base.one_shot || self.one_shot,
             manual_recovery: self
                 .recovery

@@ -8,7 +8,7 @@ use cantap::wire::BitTiming;
 use crate::channel_bitrate::ChannelBitrate;
 
 /// A bit timing on the command line; for commands to flatten into theirs.
-#[derive(clap::Args, Clone)]
+#[derive(clap::Args, Clone, Debug, Default)]
 pub struct TimingArgs {
     /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
@@ -26,7 +26,7 @@ pub struct TimingArgs {
 }
 
 /// What one may wish of a timing beside its bit rate.
-#[derive(clap::Args, Clone)]
+#[derive(clap::Args, Clone, Debug, Default)]
 pub struct Wishes {
     /// Sample point in per cent of the bit, instead of the one that CiA recommends.
     #[arg(long, value_name = "PCT", value_parser = percent)]
@@ -47,6 +47,17 @@ impl Wishes {
 }
 
 impl TimingArgs {
+    /// Whether any timing was asked for.
+    pub fn is_given(&self) -> bool {
+        !self.bitrates.is_empty() || self.segments.is_some() || self.btr.is_some()
+    }
+
+    /// Asks for these bit rates in place of any other timing.
+    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
+        (self.segments, self.btr) = (None, None);
+        self.bitrates = rates;
+    }
+
     /// What was asked for on a channel, if anything was.
     pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;

@@ -12,12 +12,12 @@ use cantap::signals::Decoder;
 use cantap::wire::message::Mode;
 
 use crate::args;
+use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::DatabaseArgs;
-use crate::monitor::app::{App, View, channels_of};
+use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
 use crate::monitor::profile::Profile;
-use crate::monitor::sending::{SendEntry, parse_entry};
 use crate::monitor::source::{Order, Origin, Plan};
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, run as show};
@@ -37,12 +37,13 @@ pub struct Args {
     /// The device.
     #[arg(short, long)]
     device: Option<Address>,
-    /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
-    /// repeated.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE")]
-    bitrates: Vec<ChannelBitrate>,
-    /// Take part in the bus: acknowledge, and send on request. Listen-only without it.
-    #[arg(long)]
+    /// Which channels: 1, 2 or both. Without it, those whose bit rate is given; both if none is.
+    #[arg(short, long, value_parser = args::channels, conflicts_with = "file")]
+    channel: Option<args::Channels>,
+    #[command(flatten)]
+    open: ChannelArgs,
+    /// Take part in the bus: acknowledge, and send on request. Listen-only without it. The same as --mode normal.
+    #[arg(long, conflicts_with = "mode")]
     normal: bool,
     #[command(flatten)]
     databases: DatabaseArgs,
@@ -94,27 +95,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut complaints = Vec::new();
     let profile = load_profile(args.profile.as_deref(), &mut complaints);
     let decoder = load_databases(args, &profile, &mut complaints);
-    let mut rates = bit_rates(args, &profile, &mut complaints);
-    if rates.is_empty() && args.file.is_none() && is_virtual(args, &profile) {
-        // Its buses take the bit rate of whoever opens them.
-        rates.push(ChannelBitrate { channel: None, bitrate_bps: 500_000 });
-    }
-    let options = ChannelBitrate::options(&rates);
+    let open = channel_args(args, &profile, &mut complaints);
+    let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
-    model.filters.clone_from(&args.filter);
-    for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
-        match text.parse() {
-            Ok(filter) => model.filters.push(filter),
-            Err(error) => complaints.push(format!("filter {text}: {error}")),
-        }
-    }
+    let filters = filters(args, &profile, &mut complaints);
+    model.history.set_filters(filters, None);
     for name in &profile.graph {
-        model.signals.choose(name);
+        model.seen.signals.choose(name);
     }
     let (origin, plan) = if let Some(path) = &args.file {
         (Origin::File(path.clone()), None)
     } else {
-        let plan = plan(args, &profile, &rates, &mut complaints)?;
+        let plan = plan(args, &profile, open, &mut complaints);
         (Origin::Device(plan.clone()), Some(plan))
     };
     let theme = Theme::from_environment(args.light || profile.light);
@@ -138,15 +130,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-/// Whether the device is, or by default will be, the virtual one.
-fn is_virtual(args: &Args, profile: &Profile) -> bool {
-    match (&args.device, &profile.device) {
-        (Some(address), _) => matches!(address, Address::Virtual(_)),
-        (None, Some(text)) => matches!(text.parse(), Ok(Address::Virtual(_))),
-        (None, None) => true,
-    }
-}
-
 fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {
     let loaded = path.map(Profile::load).transpose();
     loaded
@@ -162,26 +145,35 @@ fn load_databases(args: &Args, profile: &Profile, complaints: &mut Vec<String>) 
     args.databases.load_what_can_be(own, complaints)
 }
 
-fn bit_rates(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<ChannelBitrate> {
-    if !args.bitrates.is_empty() {
-        return args.bitrates.clone();
-    }
-    let mut rates = Vec::new();
-    for text in &profile.bitrates {
-        match text.parse() {
-            Ok(rate) => rates.push(rate),
-            Err(reason) => complaints.push(format!("bit rate {text}: {reason}")),
+/// How channels are opened: what the command line leaves open, the profile says.
+fn channel_args(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> ChannelArgs {
+    let mut open = args.open.clone();
+    if !open.timing.is_given() {
+        for text in &profile.bitrates {
+            match text.parse() {
+                Ok(rate) => open.timing.bitrates.push(rate),
+                Err(reason) => complaints.push(format!("bit rate {text}: {reason}")),
+            }
         }
     }
-    rates
+    if open.mode().is_none() && (args.normal || profile.normal) {
+        open.set_mode(Mode::Normal);
+    }
+    open
 }
 
-fn plan(
-    args: &Args,
-    profile: &Profile,
-    rates: &[ChannelBitrate],
-    complaints: &mut Vec<String>,
-) -> anyhow::Result<Plan> {
+fn filters(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<Filter> {
+    let mut filters = args.filter.clone();
+    for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
+        match text.parse() {
+            Ok(filter) => filters.push(filter),
+            Err(error) => complaints.push(format!("filter {text}: {error}")),
+        }
+    }
+    filters
+}
+
+fn plan(args: &Args, profile: &Profile, open: ChannelArgs, complaints: &mut Vec<String>) -> Plan {
     let address = match (&args.device, &profile.device) {
         (Some(address), _) => address.clone(),
         (None, Some(text)) => text.parse().unwrap_or_else(|error| {
@@ -190,12 +182,12 @@ fn plan(
         }),
         (None, None) => Address::Virtual(String::new()),
     };
-    let mode = if args.normal || profile.normal { Mode::Normal } else { Mode::ListenOnly };
-    Ok(Plan {
-        address,
-        channels: channels_of(rates).map_err(|reason| anyhow::anyhow!("{reason} (-b)"))?,
-        mode,
-    })
+    let mut plan = Plan { address, channels: Vec::new(), open };
+    match args.channel {
+        Some(channels) => plan.channels = channels.iter().collect(),
+        None => plan.choose_channels(),
+    }
+    plan
 }
 
 fn send_list(profile: &Profile, model: &Model, complaints: &mut Vec<String>) -> Vec<SendEntry> {

@@ -5,36 +5,31 @@ pub mod app;
 pub mod model;
 pub mod profile;
 mod recorder;
-pub mod sending;
+mod screen;
 pub mod source;
 #[cfg(test)]
 mod tests;
 pub mod theme;
 pub mod views;
 
-use std::io::{IsTerminal, Write};
 use std::sync::mpsc::channel;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use ratatui::Terminal;
-use ratatui::backend::{CrosstermBackend, TestBackend};
+use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
-use ratatui::crossterm::event::{self, DisableMouseCapture, EnableMouseCapture, Event, KeyEventKind};
-use ratatui::crossterm::execute;
-use ratatui::crossterm::terminal::{
-    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
-};
+use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
+use crate::interrupt;
 use app::{App, Flow};
 use model::{Model, SourceState};
+use screen::Screen;
 use source::{Order, Origin, Shared, lock};
 
 /// The display is drawn anew so often: 25 times a second.
 const FRAME: Duration = Duration::from_millis(40);
-/// The row where a page's own rows begin, its heading.
-const BODY_ROW: u16 = 2;
 
 /// Shows the display until the user leaves.
 pub fn run(
@@ -43,21 +38,12 @@ pub fn run(
     model: Model,
     orders: std::sync::mpsc::Receiver<Order>,
 ) -> anyhow::Result<()> {
-    if !std::io::stdout().is_terminal() || !std::io::stdin().is_terminal() {
-        bail!(
-            "the live view needs a terminal; use --once for one screen, or `cantap capture` and `cantap stats`"
-        );
-    }
+    interrupt::watch()?;
+    let mut screen = Screen::enter()?;
     let model: Shared = Arc::new(Mutex::new(model));
-    let for_thread = Arc::clone(&model);
-    let thread = std::thread::Builder::new()
-        .name("cantap-source".to_owned())
-        .spawn(move || source::run(origin, &for_thread, &orders))?;
-    let result = {
-        let _screen = Screen::enter()?;
-        let mut terminal = Terminal::new(CrosstermBackend::new(std::io::stdout()))?;
-        display(&mut terminal, &mut app, &model)
-    };
+    let thread = start(origin, &model, orders)?;
+    let result = display(&mut screen, &mut app, &model);
+    drop(screen);
     // The source ends the recording properly before it goes.
     let _ = app.orders.send(Order::Quit);
     if thread.join().is_err() {
@@ -70,84 +56,75 @@ pub fn run(
     result
 }
 
-fn display(
-    terminal: &mut Terminal<CrosstermBackend<std::io::Stdout>>,
-    app: &mut App,
+fn start(
+    origin: Origin,
     model: &Shared,
-) -> anyhow::Result<()> {
-    loop {
+    orders: std::sync::mpsc::Receiver<Order>,
+) -> std::io::Result<std::thread::JoinHandle<()>> {
+    let model = Arc::clone(model);
+    let body = move || source::run(origin, &model, &orders);
+    std::thread::Builder::new().name("cantap-source".to_owned()).spawn(body)
+}
+
+fn display(screen: &mut Screen, app: &mut App, model: &Shared) -> anyhow::Result<()> {
+    let stops = Stops::watch()?;
+    while !interrupt::requested() {
         let drawn = Instant::now();
-        {
-            let model = lock(model);
-            terminal.draw(|frame| views::draw(frame, app, &model))?;
-        }
+        screen.draw(app, model)?;
+        let mut flow = if stops.asked() { Flow::Suspend } else { Flow::GoOn };
         // What happens meanwhile is answered at once.
         let mut wait = FRAME.saturating_sub(drawn.elapsed());
-        while event::poll(wait)? {
+        while flow == Flow::GoOn && event::poll(wait)? {
+            let event = event::read()?;
             let mut model = lock(model);
-            let flow = match event::read()? {
-                Event::Key(key) if key.kind != KeyEventKind::Release => app.key(key, &mut model),
-                Event::Mouse(mouse) => {
-                    app.mouse(mouse, BODY_ROW, &mut model);
-                    Flow::GoOn
-                }
-                _ => Flow::GoOn,
-            };
-            if flow == Flow::Quit {
-                return Ok(());
+            match event {
+                Event::Key(key) if key.kind != KeyEventKind::Release => flow = app.key(key, &mut model),
+                Event::Mouse(mouse) => app.mouse(mouse, &mut model),
+                _ => {}
             }
             wait = Duration::ZERO;
         }
+        match flow {
+            Flow::GoOn => {}
+            Flow::Quit => break,
+            Flow::Suspend => screen.suspend()?,
+        }
         if let Some(text) = app.clipboard.take() {
-            copy(&text)?;
+            screen::copy(&text)?;
         }
     }
+    Ok(())
 }
 
-/// Puts text into the clipboard through the terminal (xterm's OSC 52), which works over a network too.
-fn copy(text: &str) -> std::io::Result<()> {
-    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-    let mut encoded = String::new();
-    for piece in text.as_bytes().chunks(3) {
-        let bits =
-            piece.iter().chain([0, 0].iter()).take(3).fold(0u32, |bits, byte| bits << 8 | u32::from(*byte));
-        for digit in 0..4 {
-            let value = bits >> (18 - 6 * digit) & 63;
-            encoded.push(if digit <= piece.len() { DIGITS[value as usize] as char } else { '=' });
-        }
-    }
-    let mut out = std::io::stdout();
-    write!(out, "\x1b]52;c;{encoded}\x07")?;
-    out.flush()
+/// Whether another program asked this one to stop for a while (SIGTSTP), as a shell's job control does.
+struct Stops {
+    #[cfg(unix)]
+    asked: Arc<std::sync::atomic::AtomicBool>,
 }
 
-/// The terminal in our hands; given back however we leave.
-struct Screen;
-
-impl Screen {
-    fn enter() -> anyhow::Result<Self> {
-        let before = std::panic::take_hook();
-        // A panic's message must not be lost with the alternate screen.
-        std::panic::set_hook(Box::new(move |info| {
-            Self::leave();
-            before(info);
-        }));
-        enable_raw_mode()?;
-        let screen = Self;
-        execute!(std::io::stdout(), EnterAlternateScreen, EnableMouseCapture)?;
-        Ok(screen)
+impl Stops {
+    #[cfg(unix)]
+    fn watch() -> std::io::Result<Self> {
+        let asked = Arc::default();
+        signal_hook::flag::register(signal_hook::consts::SIGTSTP, Arc::clone(&asked))?;
+        Ok(Self { asked })
     }
 
-    fn leave() {
-        // There is nobody left to tell if that fails.
-        let _ = execute!(std::io::stdout(), DisableMouseCapture, LeaveAlternateScreen);
-        let _ = disable_raw_mode();
+    #[cfg(unix)]
+    fn asked(&self) -> bool {
+        self.asked.swap(false, std::sync::atomic::Ordering::Relaxed)
     }
-}
 
-impl Drop for Screen {
-    fn drop(&mut self) {
-        Self::leave();
+    #[cfg(not(unix))]
+    #[expect(clippy::unnecessary_wraps, reason = "it can fail where there are signals")]
+    fn watch() -> std::io::Result<Self> {
+        Ok(Self {})
+    }
+
+    #[cfg(not(unix))]
+    #[expect(clippy::unused_self, reason = "there are no such signals here")]
+    fn asked(&self) -> bool {
+        false
     }
 }
 
@@ -162,10 +139,7 @@ pub fn once(
 ) -> anyhow::Result<String> {
     let is_file = matches!(origin, Origin::File(_));
     let model: Shared = Arc::new(Mutex::new(model));
-    let for_thread = Arc::clone(&model);
-    let thread = std::thread::Builder::new()
-        .name("cantap-source".to_owned())
-        .spawn(move || source::run(origin, &for_thread, &orders))?;
+    let thread = start(origin, &model, orders)?;
     if is_file {
         // As fast as it can be read.
         for _ in 0..20 {
@@ -182,6 +156,7 @@ pub fn once(
             _ => std::thread::sleep(Duration::from_millis(10)),
         }
     }
+    app.catch_up(&mut lock(&model));
     let text = screen_text(&mut app, &lock(&model), size)?;
     let _ = app.orders.send(Order::Quit);
     if thread.join().is_err() {

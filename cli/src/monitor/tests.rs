@@ -31,9 +31,9 @@ fn model() -> Model {
     let decoder = Decoder::new(vec![Source { channel: None, database }]);
     let options = Options { bitrate_bps: Some(250_000), ..Options::default() };
     let mut model = Model::new(decoder.into(), options, 1_000_000).unwrap();
-    model.signals.choose("Speed");
-    model.signals.choose("Course");
-    model.signals.choose("Moving");
+    model.seen.signals.choose("Speed");
+    model.seen.signals.choose("Course");
+    model.seen.signals.choose("Moving");
     let log = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/tests/data/nmea2000.log.gz");
     let records = open_reader(log, &ReadOptions::default()).unwrap();
     let mut records: Vec<_> = records.take(6000).map(Result::unwrap).collect();
@@ -57,11 +57,8 @@ fn model() -> Model {
 fn app(view: View) -> (App, Receiver<Order>) {
     let (sender, receiver) = orders();
     let theme = Theme { colour: true, light: false, unicode: true };
-    let plan = Plan {
-        address: Address::Virtual(String::new()),
-        channels: vec![(Channel::Can1, 250_000)],
-        mode: Mode::ListenOnly,
-    };
+    let options = Options { channel_bitrate_bps: vec![(1, 250_000)], ..Options::default() };
+    let plan = Plan::listening(Address::Virtual(String::new()), &options);
     (App::new(view, theme, Some(plan), sender), receiver)
 }
 
@@ -185,9 +182,9 @@ fn pausing_stops_the_display_but_not_the_model() {
         let rows = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
         let before = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
         let last = *model.history.get(model.history.end() - 1).unwrap();
-        let taken = model.taken;
+        let taken = model.seen.taken;
         model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000, ..last }; 3]);
-        assert_eq!(model.taken, taken + 3);
+        assert_eq!(model.seen.taken, taken + 3);
         let after = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
         if view == View::Fixed {
             assert_eq!(before, after);
@@ -229,7 +226,7 @@ fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
     assert_eq!(app.message, "listen-only: nothing is sent; press m to take part in the bus");
     assert!(orders.try_recv().is_err());
     press(&mut app, &mut model, "m");
-    assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode == Mode::Normal));
+    assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode() == Mode::Normal));
     press(&mut app, &mut model, "\n");
     assert!(matches!(orders.try_recv().unwrap(), Order::Send(Channel::Can1, _)));
     press(&mut app, &mut model, " ");
@@ -245,11 +242,11 @@ fn what_is_typed_wrong_is_explained_and_stays_to_be_mended() {
     let (mut app, _orders) = app(View::Send);
     press(&mut app, &mut model, "a123#1\n");
     assert!(app.message.contains("pairs of hexadecimal digits"), "{}", app.message);
-    assert_eq!(app.prompt.as_ref().unwrap().text, "123#1");
+    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "123#1");
     press(&mut app, &mut model, "1\n");
     assert_eq!((app.prompt.is_none(), app.send.len()), (true, 1));
     press(&mut app, &mut model, "b");
-    assert_eq!(app.prompt.as_ref().unwrap().text, "1:250000");
+    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "1:250000");
 }
 
 #[test]
@@ -257,7 +254,10 @@ fn clearing_forgets_what_was_seen_only() {
     let mut model = model();
     let (mut app, _orders) = app(View::Fixed);
     press(&mut app, &mut model, "tc");
-    assert_eq!((model.table.rows().len(), model.taken, model.statistics.channels().len()), (0, 0, 0));
+    assert_eq!(
+        (model.seen.table.rows().len(), model.seen.taken, model.seen.statistics.channels().len()),
+        (0, 0, 0)
+    );
     assert_eq!(app.time_mode, TimeMode::Delta);
     screen_text(&mut app, &model, (80, 24)).unwrap();
 }

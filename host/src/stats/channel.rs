@@ -217,16 +217,23 @@ impl ChannelStatistics {
     }
 
     /// The interval from the last frame to the next one says nothing.
-    pub(super) fn interrupt(&mut self) {
+    fn interrupt(&mut self) {
         self.gaps = self.gaps.wrapping_add(1);
         if let Some(load) = &mut self.load {
             load.gap();
         }
     }
 
+    /// Nothing at all is known about the time from the last record to the next one.
+    pub(super) fn suspend(&mut self) {
+        self.interrupt();
+        self.latest_frame_ns = None;
+        self.windows.suspend();
+    }
+
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
-        // Only a record's own time may say that the clock was set back.
-        if now_ns > self.latest_ns {
+        // Only a record's own time may say that the clock was set back, or that a suspended time is over.
+        if now_ns > self.latest_ns && !self.windows.is_suspended() {
             self.windows.advance(now_ns, closed);
         }
     }

@@ -166,6 +166,8 @@ pub(super) struct Windows {
     whole: u64,
     load_min: f64,
     load_sum: f64,
+    /// Nothing is known from the last record to the next one: no window spans that time.
+    suspended: bool,
 }
 
 impl Windows {
@@ -186,14 +188,27 @@ impl Windows {
             whole: 0,
             load_min: f64::INFINITY,
             load_sum: 0.0,
+            suspended: false,
         }
+    }
+
+    /// From here to the next record nothing is known: the window that runs says nothing, and those until then are none.
+    pub(super) fn suspend(&mut self) {
+        self.suspended = true;
+    }
+
+    /// Whether that is so, and no record has come since.
+    pub(super) fn is_suspended(&self) -> bool {
+        self.suspended
     }
 
     /// Time has come to `now_ns`: closes every window that ended before.
     #[inline]
     pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
         let ahead = now_ns.saturating_sub(self.current.start_ns);
-        if ahead >= self.length_ns as i64 {
+        if self.suspended {
+            self.resume(now_ns, closed);
+        } else if ahead >= self.length_ns as i64 {
             self.advance_slowly(now_ns, closed);
         } else if ahead < -(self.length_ns as i64) {
             self.start_over(now_ns, closed);
@@ -209,6 +224,15 @@ impl Windows {
         let mut cut = std::mem::replace(&mut self.current, window);
         self.finish_load(&mut cut);
         closed(&cut);
+    }
+
+    /// The first record after [`Self::suspend`]: the grid begins anew at `now_ns`.
+    #[cold]
+    fn resume(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        self.close_pending(closed);
+        self.suspended = false;
+        self.carry_ns = 0;
+        self.current = Window::new(self.current.channel, now_ns, self.length_ns);
     }
 
     #[cold]
@@ -302,6 +326,9 @@ impl Windows {
     /// The trace ends at `now_ns`: closes what is whole, and the rest, cut short, without counting it among
     /// the extremes unless it is all there is.
     pub(super) fn finish(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        if self.suspended {
+            return self.close_pending(closed);
+        }
         self.advance(now_ns, closed);
         self.close_pending(closed);
         let rest = self.running(now_ns);

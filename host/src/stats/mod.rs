@@ -150,10 +150,10 @@ impl Statistics {
         self.channels.len() - 1
     }
 
-    /// Nothing is known about the time from here to the next record, as while a device was gone: no interval
-    /// that spans it counts for load or period.
+    /// Nothing is known about the time from here to a channel's next record, as while a device was gone: no interval
+    /// and no window that spans it counts for load, rate or period.
     pub fn interrupt(&mut self) {
-        self.channels.iter_mut().for_each(ChannelStatistics::interrupt);
+        self.channels.iter_mut().for_each(ChannelStatistics::suspend);
     }
 
     /// Time has come to `now_ns` without a record: windows that are over by then are closed.

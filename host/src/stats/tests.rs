@@ -110,6 +110,35 @@ fn an_interruption_counts_for_neither_load_nor_period() {
 }
 
 #[test]
+fn no_window_and_no_rate_spans_an_interruption() {
+    let mut statistics = at_1_mbit();
+    let mut windows = Vec::new();
+    let second = |statistics: &mut Statistics, second: i64, windows: &mut Vec<Window>| {
+        for n in 0..10 {
+            let record = frame(second * 1_000_000 + n * 100_000, 1, "000#55");
+            statistics.push_with(&record, |window| windows.push(*window));
+        }
+    };
+    for n in 0..3 {
+        second(&mut statistics, n, &mut windows);
+    }
+    statistics.interrupt();
+    // Time that passes meanwhile makes no empty windows.
+    statistics.advance_with(50_000_000_000, |window| windows.push(*window));
+    for n in 100..103 {
+        second(&mut statistics, n, &mut windows);
+    }
+    statistics.finish_with(|window| windows.push(*window));
+    assert!(windows.iter().all(|window| window.frames >= 9), "{windows:?}");
+    let channel = &statistics.channels()[0];
+    assert!((channel.frames_per_s() - 10.0).abs() < 0.5, "{}", channel.frames_per_s());
+    assert!(channel.window_extremes_pct().unwrap().0 > 0.05);
+    // Interrupted for good.
+    statistics.interrupt();
+    statistics.finish_with(|window| panic!("{window:?}"));
+}
+
+#[test]
 fn time_that_comes_late_without_a_record_changes_nothing() {
     let mut statistics = at_1_mbit();
     let mut windows = 0;

@@ -63,8 +63,9 @@ impl Row {
     }
 
     fn take(&mut self, time_ns: i64, frame: Frame, direction: Direction) {
-        if self.count > 0 && !self.gap {
-            let interval = time_ns.saturating_sub(self.last_ns).max(0) as f64;
+        // A clock that was set back, as where a file begins anew, says nothing either.
+        if self.count > 0 && !self.gap && time_ns >= self.last_ns {
+            let interval = time_ns.saturating_sub(self.last_ns) as f64;
             match &mut self.period_ns {
                 Some(period) => {
                     let deviation = (interval - *period).abs();
@@ -90,6 +91,12 @@ impl Row {
         self.last_ns = time_ns;
         self.frame = frame;
         self.direction = direction;
+    }
+
+    /// Its last frame as a record.
+    pub fn last(&self) -> TraceRecord {
+        let event = TraceEvent::Frame { frame: self.frame, direction: self.direction, late: false };
+        TraceRecord { time_ns: self.last_ns, channel: self.channel, event }
     }
 
     /// Whether a byte has bits whose changes are shown.
@@ -143,6 +150,11 @@ impl FixedTable {
             }
             _ => {}
         }
+    }
+
+    /// Nothing is known about the time from here to the next frames: the intervals say nothing.
+    pub fn interrupt(&mut self) {
+        self.rows.iter_mut().for_each(|row| row.gap = true);
     }
 
     /// The rows.

@@ -1,14 +1,23 @@
-//! The last records, within a budget of memory.
+//! The last records, within a budget of memory, and which of them are listed.
 
 use std::collections::VecDeque;
 
 use cantap::TraceRecord;
+use cantap::filter::Filter;
 
-/// Records by number: the first ever has number 0, and a number stays what it is.
+/// The past: every record, and a list of those that the filters accept.
+///
+/// A place in the list counts from the first record ever listed, and stays what it is while older ones make room.
 pub struct History {
     records: VecDeque<TraceRecord>,
     most: usize,
+    /// Number of the oldest record, from the first one ever.
     first: u64,
+    filters: Vec<Filter>,
+    /// Numbers of the accepted records; all are listed without filters.
+    listed: VecDeque<u64>,
+    /// Place of the first of them.
+    first_listed: u64,
 }
 
 impl History {
@@ -16,31 +25,90 @@ impl History {
     pub fn new(bytes: usize) -> Self {
         let most = (bytes / size_of::<TraceRecord>()).max(1000);
         // Reserved at once: growing would copy everything, and the display would stand still meanwhile.
-        Self { records: VecDeque::with_capacity(most), most, first: 0 }
+        let records = VecDeque::with_capacity(most);
+        Self { records, most, first: 0, filters: Vec::new(), listed: VecDeque::new(), first_listed: 0 }
     }
 
     /// Appends a record; the oldest makes room.
     pub fn push(&mut self, record: TraceRecord) {
         if self.records.len() == self.most {
             self.records.pop_front();
+            if self.listed.front() == Some(&self.first) {
+                self.listed.pop_front();
+                self.first_listed += 1;
+            }
             self.first += 1;
+        }
+        if !self.filters.is_empty() && self.accepts(&record) {
+            self.listed.push_back(self.first + self.records.len() as u64);
         }
         self.records.push_back(record);
     }
 
-    /// Number of the oldest record that is still there.
+    /// The filters.
+    pub fn filters(&self) -> &[Filter] {
+        &self.filters
+    }
+
+    /// Whether a record is to be shown: without filters, or if one of them accepts it.
+    pub fn accepts(&self, record: &TraceRecord) -> bool {
+        self.filters.is_empty() || self.filters.iter().any(|filter| filter.accepts(record))
+    }
+
+    /// Lists only what one of these accepts, of the past too. Returns where the record listed at `place` is now, or
+    /// the next one listed.
+    pub fn set_filters(&mut self, filters: Vec<Filter>, place: Option<u64>) -> Option<u64> {
+        let number = place.map(|place| self.number(place));
+        self.filters = filters;
+        let accepted = (self.first..)
+            .zip(&self.records)
+            .filter(|(_, record)| !self.filters.is_empty() && self.accepts(record))
+            .map(|(number, _)| number);
+        self.listed = accepted.collect();
+        self.first_listed = 0;
+        number.map(|number| {
+            if self.filters.is_empty() {
+                number
+            } else {
+                self.listed.partition_point(|listed| *listed < number) as u64
+            }
+        })
+    }
+
+    /// The number of the record listed at a place.
+    fn number(&self, place: u64) -> u64 {
+        if self.filters.is_empty() {
+            return place;
+        }
+        let index = place.saturating_sub(self.first_listed) as usize;
+        self.listed.get(index).copied().unwrap_or(self.first + self.records.len() as u64)
+    }
+
+    /// Place of the oldest listed record that is still there.
     pub fn first(&self) -> u64 {
-        self.first
+        if self.filters.is_empty() { self.first } else { self.first_listed }
     }
 
-    /// Number that the next record will have.
+    /// Place that the next listed record will have.
     pub fn end(&self) -> u64 {
-        self.first + self.records.len() as u64
+        if self.filters.is_empty() {
+            self.first + self.records.len() as u64
+        } else {
+            self.first_listed + self.listed.len() as u64
+        }
     }
 
-    /// The record of that number, if it is still there.
-    pub fn get(&self, number: u64) -> Option<&TraceRecord> {
-        self.records.get(usize::try_from(number.checked_sub(self.first)?).ok()?)
+    /// The record listed at a place, if it is still there.
+    pub fn get(&self, place: u64) -> Option<&TraceRecord> {
+        if place < self.first() || place >= self.end() {
+            return None;
+        }
+        self.records.get(usize::try_from(self.number(place) - self.first).ok()?)
+    }
+
+    /// Records there are, listed or not.
+    pub fn len(&self) -> usize {
+        self.records.len()
     }
 
     /// Bytes in use, and bytes there may be.
@@ -48,17 +116,19 @@ impl History {
         (self.records.len() * size_of::<TraceRecord>(), self.most * size_of::<TraceRecord>())
     }
 
-    /// Forgets everything; numbers go on.
+    /// Forgets everything but the filters; numbers and places go on.
     pub fn clear(&mut self) {
-        self.first = self.end();
+        self.first += self.records.len() as u64;
+        self.first_listed += self.listed.len() as u64;
         self.records.clear();
+        self.listed.clear();
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap::TraceEvent;
+    use cantap::{Direction, TraceEvent};
 
     #[test]
     fn the_oldest_makes_room_and_numbers_stay() {
@@ -77,5 +147,35 @@ mod tests {
         assert_eq!(history.records.capacity(), capacity);
         history.clear();
         assert_eq!((history.first(), history.end(), history.get(2499)), (2500, 2500, None));
+    }
+
+    fn frame(n: i64) -> TraceRecord {
+        let frame = if n % 3 == 0 { "123#" } else { "124#" }.parse().unwrap();
+        let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+        TraceRecord { time_ns: n, channel: 1, event }
+    }
+
+    fn listed(history: &History) -> Vec<i64> {
+        (history.first()..history.end()).map(|place| history.get(place).unwrap().time_ns).collect()
+    }
+
+    #[test]
+    fn filters_list_the_past_and_what_comes_and_keep_what_they_do_not_list() {
+        let mut history = History::new(0);
+        (0..10).for_each(|n| history.push(frame(n)));
+        // The fifth record is not listed any more: the next one is.
+        assert_eq!(history.set_filters(vec!["123:7FF".parse().unwrap()], Some(5)), Some(2));
+        assert_eq!(listed(&history), [0, 3, 6, 9]);
+        (10..1004).for_each(|n| history.push(frame(n)));
+        assert_eq!((history.len(), history.first(), history.end()), (1000, 2, 335));
+        assert_eq!(listed(&history), (6..1004).step_by(3).collect::<Vec<_>>());
+        assert_eq!(history.set_filters(Vec::new(), Some(2)), Some(6));
+        assert_eq!(listed(&history), (4..1004).collect::<Vec<_>>());
+        // Nothing is listed, and a place behind the end is none.
+        assert_eq!(history.set_filters(vec!["7FF:7FF".parse().unwrap()], Some(500)), Some(0));
+        assert_eq!((history.first(), history.end(), history.get(0)), (0, 0, None));
+        history.clear();
+        assert_eq!(history.set_filters(Vec::new(), None), None);
+        assert_eq!((history.first(), history.end()), (1004, 1004));
     }
 }

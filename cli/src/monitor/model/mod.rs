@@ -1,5 +1,5 @@
 //! What the live view knows: a bounded past, one row per identifier, signals, statistics. A source thread
-//! fills it; the views only read it.
+//! fills it; the pages only read it.
 
 pub mod fixed;
 pub mod history;
@@ -9,16 +9,17 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-use cantap::TraceRecord;
 use cantap::device::{ClockReport, Counters};
-use cantap::filter::Filter;
 use cantap::signals::Decoder;
 use cantap::stats::{Options, Statistics, Window};
 use cantap::wire::message::Status;
+use cantap::{Channel, TraceRecord};
+
+use super::source::Plan;
 
 pub use fixed::{FixedTable, Row};
 pub use history::History;
-pub use signals::{SignalRow, SignalTable};
+pub use signals::{Sample, SignalRow, SignalTable};
 
 /// Windows of the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
@@ -35,6 +36,8 @@ pub enum SourceState {
     Running,
     /// It is gone, for this reason; it is tried again.
     Gone(String),
+    /// The bit rates of a device's channels are looked for.
+    Searching,
     /// A file, in playback.
     Playing {
         /// Delay factor.
@@ -78,10 +81,9 @@ pub struct DeviceFigures {
     pub reconnects: u32,
 }
 
-/// Everything that the views show.
-pub struct Model {
-    /// The past, record by record.
-    pub history: History,
+/// What the pages show beside the trace. A copy of it is what they show while the display is stopped.
+#[derive(Clone)]
+pub struct Seen {
     /// A row per identifier.
     pub table: FixedTable,
     /// Decoded signals.
@@ -90,16 +92,44 @@ pub struct Model {
     pub statistics: Statistics,
     /// The load of the last windows, per channel, the newest last.
     pub loads: Vec<(u8, VecDeque<Window>)>,
-    /// Only records that one of these accepts are shown; all without any.
-    pub filters: Vec<Filter>,
-    /// Time of the first record since the beginning, or since everything was forgotten.
-    pub first_ns: Option<i64>,
-    /// Records taken, those that the filters hid included.
-    pub taken: u64,
-    /// The source.
-    pub source: SourceState,
     /// The device, if the source is one.
     pub device: Option<DeviceFigures>,
+    /// Records taken.
+    pub taken: u64,
+}
+
+impl Seen {
+    /// The latest time that is known, in nanoseconds as in [`TraceRecord::time_ns`].
+    pub fn now_ns(&self) -> i64 {
+        self.statistics.last_ns().unwrap_or(0)
+    }
+
+    /// Frames lost so far, and whether there may have been more.
+    pub fn lost(&self) -> (u64, bool) {
+        let channels = self.statistics.channels();
+        let count = channels.iter().map(|channel| channel.losses.total()).sum();
+        (count, channels.iter().any(|channel| channel.losses.at_least))
+    }
+}
+
+/// Everything that there is to show.
+pub struct Model {
+    /// The past, record by record, and which filters choose what is shown of it.
+    pub history: History,
+    /// What else there is to see.
+    pub seen: Seen,
+    /// Time of the first record since the beginning, or since everything was forgotten.
+    pub first_ns: Option<i64>,
+    /// The source.
+    pub source: SourceState,
+    /// How often a device was opened: with another session, what it sent periodically has ended.
+    pub sessions: u32,
+    /// The plan with the bit rates that were found by listening, until the display has taken it over.
+    pub found: Option<Plan>,
+    /// Periodic transmissions that the device refused, by channel and slot, until the display has taken note.
+    pub refused: Vec<(Channel, u8)>,
+    /// Places in the file played back that could not be read, and what was wrong with the first of them.
+    pub unread: Option<(u64, String)>,
     /// The recording, if one runs.
     pub recording: Option<Recording>,
     /// The last thing that the user should know.
@@ -111,17 +141,23 @@ impl Model {
     /// Nothing known yet. `options` must be good for [`Statistics::new`].
     pub fn new(decoder: Arc<Decoder>, options: Options, history_bytes: usize) -> anyhow::Result<Self> {
         let options = Options { window: LOAD_WINDOW, ..options };
-        Ok(Self {
-            history: History::new(history_bytes),
+        let seen = Seen {
             table: FixedTable::default(),
             signals: SignalTable::new(decoder),
             statistics: Statistics::new(options.clone())?,
             loads: Vec::new(),
-            filters: Vec::new(),
-            first_ns: None,
-            taken: 0,
-            source: SourceState::default(),
             device: None,
+            taken: 0,
+        };
+        Ok(Self {
+            history: History::new(history_bytes),
+            seen,
+            first_ns: None,
+            source: SourceState::default(),
+            sessions: 0,
+            found: None,
+            refused: Vec::new(),
+            unread: None,
             recording: None,
             notice: String::new(),
             options,
@@ -138,50 +174,54 @@ impl Model {
         if let (None, Some(first)) = (self.first_ns, records.first()) {
             self.first_ns = Some(first.time_ns);
         }
-        let loads = &mut self.loads;
+        let Seen { table, signals, statistics, loads, taken, .. } = &mut self.seen;
         for record in records {
-            self.statistics.push_with(record, |window| keep_load(loads, window));
-            if !self.filters.is_empty() && !self.filters.iter().any(|filter| filter.accepts(record)) {
-                continue;
-            }
+            statistics.push_with(record, |window| keep_load(loads, window));
             self.history.push(*record);
-            self.table.take(record);
-            self.signals.take(record);
+            table.take(record);
+            signals.take(record);
         }
-        self.taken += records.len() as u64;
+        *taken += records.len() as u64;
     }
 
     /// Time has come to `now_ns` although nothing happened.
     pub fn advance(&mut self, now_ns: i64) {
-        let loads = &mut self.loads;
-        self.statistics.advance_with(now_ns, |window| keep_load(loads, window));
+        let Seen { statistics, loads, .. } = &mut self.seen;
+        statistics.advance_with(now_ns, |window| keep_load(loads, window));
     }
 
-    /// The latest time that is known, in nanoseconds as in [`TraceRecord::time_ns`].
-    pub fn now_ns(&self) -> i64 {
-        self.statistics.last_ns().unwrap_or(0)
+    /// Nothing is known about the time from here to the next record: no interval that spans it counts.
+    pub fn interrupt(&mut self) {
+        self.seen.statistics.interrupt();
+        self.seen.table.interrupt();
+        self.seen.signals.interrupt();
     }
 
     /// Forgets what was seen, not how things are set.
     pub fn clear(&mut self) {
         self.history.clear();
-        self.table = FixedTable::default();
-        self.signals.clear();
-        self.loads.clear();
-        self.taken = 0;
+        self.seen.table = FixedTable::default();
+        self.seen.signals.clear();
+        self.seen.taken = 0;
         self.first_ns = None;
+        self.begin_statistics();
+    }
+
+    /// Other buses from now on: the statistics begin anew.
+    pub fn begin_statistics(&mut self) {
         // The options were good before.
         if let Ok(statistics) = Statistics::new(self.options.clone()) {
-            self.statistics = statistics;
+            self.seen.statistics = statistics;
         }
+        self.seen.loads.clear();
     }
 
     /// Other bit rates from now on; the statistics begin anew.
     pub fn set_options(&mut self, options: Options) -> anyhow::Result<()> {
         let options = Options { window: LOAD_WINDOW, ..options };
-        self.statistics = Statistics::new(options.clone())?;
+        self.seen.statistics = Statistics::new(options.clone())?;
         self.options = options;
-        self.loads.clear();
+        self.seen.loads.clear();
         Ok(())
     }
 }

@@ -3,8 +3,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use cantap::TraceRecord;
 use cantap::signals::{Alarm, Decoder, MessageRef, Signal, SignalValue};
+use cantap::{Direction, Frame, TraceEvent, TraceRecord};
 
 /// Signals with a row; more than any screen shows.
 const MOST_SIGNALS: usize = 1024;
@@ -24,6 +24,8 @@ pub struct Sample {
     pub max: f64,
     /// The last.
     pub last: f64,
+    /// Nothing is known of the time between the sample before and this one.
+    pub after_gap: bool,
 }
 
 /// One signal on one channel.
@@ -35,6 +37,8 @@ pub struct SignalRow {
     pub message: MessageRef,
     /// Its index in the message.
     pub signal: u32,
+    /// The frame that had the last value.
+    pub frame: Frame,
     /// The last value's bits.
     pub raw: u64,
     /// The last value.
@@ -49,9 +53,20 @@ pub struct SignalRow {
     pub samples: VecDeque<Sample>,
     /// In the graph.
     pub chosen: bool,
+    /// Nothing is known of the time since the last sample.
+    gap: bool,
+}
+
+impl SignalRow {
+    /// The frame that had the last value, as a record.
+    pub fn last(&self) -> TraceRecord {
+        let event = TraceEvent::Frame { frame: self.frame, direction: Direction::Rx, late: false };
+        TraceRecord { time_ns: self.time_ns, channel: self.channel, event }
+    }
 }
 
 /// All signals seen, in order of appearance.
+#[derive(Clone)]
 pub struct SignalTable {
     decoder: Arc<Decoder>,
     rows: Vec<SignalRow>,
@@ -75,13 +90,13 @@ impl SignalTable {
         let mut values = std::mem::take(&mut self.values);
         if let Some(message) = self.decoder.decode(record.channel, frame, &mut values) {
             for value in &values {
-                self.value(record, message, value);
+                self.value(record, *frame, message, value);
             }
         }
         self.values = values;
     }
 
-    fn value(&mut self, record: &TraceRecord, message: MessageRef, value: &SignalValue) {
+    fn value(&mut self, record: &TraceRecord, frame: Frame, message: MessageRef, value: &SignalValue) {
         let key = (record.channel, message, value.signal);
         let place = match self.places.get(&key) {
             Some(place) => *place,
@@ -90,12 +105,14 @@ impl SignalTable {
                     channel: record.channel,
                     message,
                     signal: value.signal,
+                    frame,
                     raw: value.raw,
                     value: value.value,
                     time_ns: record.time_ns,
                     min: value.value,
                     max: value.value,
                     samples: VecDeque::new(),
+                    gap: false,
                     chosen: self.chosen.iter().any(|name| {
                         *name == self.decoder.message(message).signals[value.signal as usize].name
                     }),
@@ -106,6 +123,7 @@ impl SignalTable {
             None => return,
         };
         let row = &mut self.rows[place];
+        row.frame = frame;
         row.raw = value.raw;
         row.value = value.value;
         row.time_ns = record.time_ns;
@@ -116,15 +134,22 @@ impl SignalTable {
         let slot = time_ns.div_euclid(SAMPLE_NS);
         match row.samples.back_mut() {
             Some(sample) if sample.time_ns.div_euclid(SAMPLE_NS) == slot => {
-                *sample = Sample { time_ns, min: sample.min.min(last), max: sample.max.max(last), last };
+                let (min, max) = (sample.min.min(last), sample.max.max(last));
+                *sample = Sample { time_ns, min, max, last, ..*sample };
             }
             _ => {
                 if row.samples.len() == MOST_SAMPLES {
                     row.samples.pop_front();
                 }
-                row.samples.push_back(Sample { time_ns, min: last, max: last, last });
+                let after_gap = std::mem::take(&mut row.gap);
+                row.samples.push_back(Sample { time_ns, min: last, max: last, last, after_gap });
             }
         }
+    }
+
+    /// Nothing is known of the time from here to the next values.
+    pub fn interrupt(&mut self) {
+        self.rows.iter_mut().for_each(|row| row.gap = true);
     }
 
     /// The rows.

@@ -6,7 +6,7 @@ use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
 use super::super::app::App;
-use super::super::model::{FixedTable, Model, Row};
+use super::super::model::{Model, Row, Seen};
 use super::trace::printable;
 
 /// A column to sort by.
@@ -42,13 +42,8 @@ impl Column {
 }
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
-    let frozen = app.frozen.take();
-    let (table, now_ns) = match &frozen {
-        Some((table, now_ns)) => (table, *now_ns),
-        None => (&model.table, model.now_ns()),
-    };
-    let rows = sorted(table, app, model);
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
+    let rows = sorted(app, model, seen);
     app.fixed_order = rows.iter().map(|row| (row.channel, row.frame.id())).collect();
     let mark = |column: Column, text: &str| {
         let arrow = match (app.theme.unicode, app.reverse) {
@@ -60,8 +55,8 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         };
         format!("{text}{arrow}")
     };
-    let hidden = table.rows().iter().filter(|row| row.hidden).count();
-    let more = match (hidden, table.unlisted) {
+    let hidden = seen.table.rows().len() - rows.len();
+    let more = match (hidden, seen.table.unlisted) {
         (0, 0) => String::new(),
         (hidden, 0) => format!(" ({hidden} hidden)"),
         (_, unlisted) => format!(" ({unlisted} frames of further IDs)"),
@@ -78,14 +73,12 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         if ascii { "ASCII    " } else { "" },
         mark(Column::Name, "Name"),
     ));
-    super::list(frame, area, app, heading, rows.len(), |index, app| {
-        line(rows[index], now_ns, ascii, app, model)
-    });
-    app.frozen = frozen;
+    super::list(frame, area, app, heading, rows.len(), |index, app| line(rows[index], ascii, app, seen));
 }
 
-fn sorted<'a>(table: &'a FixedTable, app: &App, model: &Model) -> Vec<&'a Row> {
-    let mut rows: Vec<_> = table.rows().iter().filter(|row| !row.hidden).collect();
+fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
+    let shown = |row: &&Row| !row.hidden && model.history.accepts(&row.last());
+    let mut rows: Vec<_> = seen.table.rows().iter().filter(shown).collect();
     let id = |row: &&Row| (row.frame.id().is_extended(), row.frame.id().raw(), row.channel);
     rows.sort_by_key(id);
     match app.sort {
@@ -98,7 +91,7 @@ fn sorted<'a>(table: &'a FixedTable, app: &App, model: &Model) -> Vec<&'a Row> {
         Column::Jitter => rows.sort_by(|a, b| b.jitter_ns.total_cmp(&a.jitter_ns)),
         Column::Time => rows.sort_by_key(|row| std::cmp::Reverse(row.last_ns)),
         // Those without a name come last.
-        Column::Name => rows.sort_by_key(|row| (name(row, model).is_empty(), name(row, model))),
+        Column::Name => rows.sort_by_key(|row| (name(row, seen).is_empty(), name(row, seen))),
     }
     if app.reverse {
         rows.reverse();
@@ -109,12 +102,12 @@ fn sorted<'a>(table: &'a FixedTable, app: &App, model: &Model) -> Vec<&'a Row> {
     rows
 }
 
-fn name<'a>(row: &Row, model: &'a Model) -> &'a str {
-    let decoder = model.signals.decoder();
+fn name<'a>(row: &Row, seen: &'a Seen) -> &'a str {
+    let decoder = seen.signals.decoder();
     decoder.find(row.channel, row.frame.id()).map_or("", |message| &decoder.message(message).name)
 }
 
-fn line(row: &Row, now_ns: i64, ascii: bool, app: &App, model: &Model) -> Line<'static> {
+fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
     let theme = app.theme;
     let base = if row.mark > 0 { theme.series(usize::from(row.mark) - 1) } else { Style::new() };
     let period = row.period_ns.map_or("–".to_owned(), |ns| format!("{:.3}", ns / 1e6));
@@ -131,15 +124,18 @@ fn line(row: &Row, now_ns: i64, ascii: bool, app: &App, model: &Model) -> Line<'
     )];
     let data = row.frame.data();
     for (index, byte) in data.iter().enumerate() {
-        let style =
-            if app.heat { heat_style(row, index, app) } else { changed_style(row, index, now_ns, app) };
+        let style = if app.heat {
+            heat_style(row, index, app)
+        } else {
+            changed_style(row, index, seen.now_ns(), app)
+        };
         spans.push(Span::styled(format!("{byte:02X}"), style));
         spans.push(Span::raw(" "));
     }
     let room = 3 * (8 - data.len());
     let characters = if ascii { format!("{:<8} ", printable(data)) } else { String::new() };
     spans.push(Span::raw(format!("{:room$}{characters}", "")));
-    spans.push(Span::styled(name(row, model).to_owned(), base));
+    spans.push(Span::styled(name(row, seen).to_owned(), base));
     Line::from(spans)
 }
 

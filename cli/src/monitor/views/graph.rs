@@ -9,37 +9,36 @@ use ratatui::widgets::canvas::{Canvas, Line as Stroke};
 use ratatui::widgets::{Block, Borders, Paragraph};
 
 use super::super::app::App;
-use super::super::model::{Model, SignalRow};
+use super::super::model::{Sample, Seen, SignalRow};
 use super::signals::short;
 
 /// Signals with two states are drawn as such.
-fn is_digital(row: &SignalRow, model: &Model) -> bool {
-    let signal = model.signals.signal(row);
+fn is_digital(row: &SignalRow, seen: &Seen) -> bool {
+    let signal = seen.signals.signal(row);
     signal.digital.is_some() || signal.length == 1
 }
 
 /// The signal's name; with its channel where another chosen one has the same.
-fn name(row: &SignalRow, model: &Model) -> String {
-    let own = &model.signals.signal(row).name;
-    let others = model.signals.rows().iter().filter(|other| other.chosen && !std::ptr::eq(*other, row));
-    let same = others.into_iter().any(|other| model.signals.signal(other).name == *own);
+fn name(row: &SignalRow, seen: &Seen) -> String {
+    let own = &seen.signals.signal(row).name;
+    let others = seen.signals.rows().iter().filter(|other| other.chosen && !std::ptr::eq(*other, row));
+    let same = others.into_iter().any(|other| seen.signals.signal(other).name == *own);
     if same { format!("{}:{own}", row.channel) } else { own.clone() }
 }
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
-    let chosen: Vec<_> = model.signals.rows().iter().filter(|row| row.chosen).collect();
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
+    let chosen: Vec<_> = seen.signals.rows().iter().filter(|row| row.chosen).collect();
     if chosen.is_empty() {
         let text = "No signal is chosen. On the page Signals (3), select one and press Enter.";
         frame.render_widget(Paragraph::new(text), area);
         return;
     }
-    // The frozen display keeps its time.
-    let now_ns = app.frozen.as_ref().map_or_else(|| model.now_ns(), |(_, now_ns)| *now_ns);
-    let digital: Vec<_> = chosen.iter().copied().filter(|row| is_digital(row, model)).collect();
+    let now_ns = seen.now_ns();
+    let digital: Vec<_> = chosen.iter().copied().filter(|row| is_digital(row, seen)).collect();
     let mut panes: Vec<(String, Vec<&SignalRow>)> = Vec::new();
-    for row in chosen.iter().copied().filter(|row| !is_digital(row, model)) {
-        let unit = &model.signals.signal(row).unit;
+    for row in chosen.iter().copied().filter(|row| !is_digital(row, seen)) {
+        let unit = &seen.signals.signal(row).unit;
         match panes.iter_mut().find(|(label, _)| !unit.is_empty() && label == unit) {
             Some((_, rows)) => rows.push(row),
             None => panes.push((unit.clone(), vec![row])),
@@ -52,11 +51,11 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let window = Window { now_ns, span_s: app.graph_span, cursor: app.graph_cursor };
     let mut colour = 0;
     for ((label, rows), area) in panes.iter().zip(areas.iter()) {
-        analogue(frame, *area, label, rows, &window, colour, app, model);
+        analogue(frame, *area, label, rows, &window, colour, app, seen);
         colour += rows.len();
     }
     for (row, area) in digital.iter().zip(areas.iter().skip(panes.len())) {
-        lane(frame, *area, row, &window, colour, app, model);
+        lane(frame, *area, row, &window, colour, app, seen);
         colour += 1;
     }
     let at = app
@@ -81,14 +80,15 @@ impl Window {
         time_ns.saturating_sub(self.now_ns) as f64 / 1e9
     }
 
-    fn shown<'a>(&self, row: &'a SignalRow) -> impl Iterator<Item = (f64, f64, f64, f64)> + use<'a> {
+    /// The samples to draw, and where on the time axis.
+    fn shown<'a>(&self, row: &'a SignalRow) -> impl Iterator<Item = (f64, &'a Sample)> + use<'a> {
         let (now, span) = (self.now_ns, self.span_s);
         // One more on the left, where the curve comes from.
         let first =
             row.samples.partition_point(|sample| (sample.time_ns.saturating_sub(now) as f64) < -span * 1e9);
         row.samples.iter().skip(first.saturating_sub(1)).map(move |sample| {
             let x = sample.time_ns.saturating_sub(now) as f64 / 1e9;
-            (x.max(-span), sample.min, sample.max, sample.last)
+            (x.max(-span), sample)
         })
     }
 
@@ -108,13 +108,13 @@ fn analogue(
     window: &Window,
     first_colour: usize,
     app: &App,
-    model: &Model,
+    seen: &Seen,
 ) {
     let mut low = f64::INFINITY;
     let mut high = f64::NEG_INFINITY;
-    for (_, min, max, _) in rows.iter().flat_map(|row| window.shown(row)) {
-        low = low.min(min);
-        high = high.max(max);
+    for (_, sample) in rows.iter().flat_map(|row| window.shown(row)) {
+        low = low.min(sample.min);
+        high = high.max(sample.max);
     }
     if low > high {
         (low, high) = (0.0, 1.0);
@@ -124,7 +124,7 @@ fn analogue(
     let mut title = vec![Span::raw(format!(" {label} {} to {} ", short(low), short(high)))];
     for (index, row) in rows.iter().enumerate() {
         let value = window.value(row).unwrap_or(row.value);
-        let text = format!("{} {}  ", name(row, model), short(value));
+        let text = format!("{} {}  ", name(row, seen), short(value));
         title.push(Span::styled(text, app.theme.series(first_colour + index)));
     }
     let colour = |style: Style| style.fg.unwrap_or_default();
@@ -135,7 +135,7 @@ fn analogue(
         .y_bounds(range)
         .paint(|context| {
             for row in rows {
-                let alarms = model.signals.signal(row).alarms;
+                let alarms = seen.signals.signal(row).alarms;
                 let limits = [(alarms.max, app.theme.error()), (alarms.min, app.theme.below())];
                 for (limit, style) in limits {
                     if let Some(y) = limit.filter(|limit| (range[0]..=range[1]).contains(limit)) {
@@ -147,12 +147,12 @@ fn analogue(
             for (index, row) in rows.iter().enumerate() {
                 let colour = colour(app.theme.series(first_colour + index));
                 let mut before: Option<(f64, f64)> = None;
-                for (x, min, max, last) in window.shown(row) {
-                    if let Some((from_x, from_y)) = before {
-                        context.draw(&Stroke::new(from_x, from_y, x, last, colour));
+                for (x, sample) in window.shown(row) {
+                    if let Some((from_x, from_y)) = before.filter(|_| !sample.after_gap) {
+                        context.draw(&Stroke::new(from_x, from_y, x, sample.last, colour));
                     }
-                    context.draw(&Stroke::new(x, min, x, max, colour));
-                    before = Some((x, last));
+                    context.draw(&Stroke::new(x, sample.min, x, sample.max, colour));
+                    before = Some((x, sample.last));
                 }
             }
             if let Some(share) = window.cursor {
@@ -171,32 +171,32 @@ fn lane(
     window: &Window,
     colour: usize,
     app: &App,
-    model: &Model,
+    seen: &Seen,
 ) {
-    let signal = model.signals.signal(row);
+    let signal = seen.signals.signal(row);
     let columns = usize::from(area.width);
     let symbols = if app.theme.unicode { [' ', '▁', '▔', '█'] } else { [' ', '_', '-', '#'] };
-    let mut seen = vec![0usize; columns];
+    let mut levels = vec![0usize; columns];
     let mut before: Option<(usize, usize)> = None;
     let mut state = false;
-    for (x, _, _, last) in window.shown(row) {
+    for (x, sample) in window.shown(row) {
         state = match signal.digital {
-            Some(digital) => digital.state(state, last),
-            None => last != 0.0,
+            Some(digital) => digital.state(state, sample.last),
+            None => sample.last != 0.0,
         };
         let place = (((x / window.span_s + 1.0) * columns as f64) as usize).min(columns.saturating_sub(1));
-        if let Some((from, level)) = before {
-            seen[from..=place].iter_mut().for_each(|cell| *cell |= level);
+        if let Some((from, level)) = before.filter(|_| !sample.after_gap) {
+            levels[from..=place].iter_mut().for_each(|cell| *cell |= level);
         }
         before = Some((place, if state { 2 } else { 1 }));
     }
     if let Some((from, level)) = before {
-        seen[from..].iter_mut().for_each(|cell| *cell |= level);
+        levels[from..].iter_mut().for_each(|cell| *cell |= level);
     }
     let style = app.theme.series(colour);
-    let line: String = seen.into_iter().map(|level| symbols[level]).collect();
+    let line: String = levels.into_iter().map(|level| symbols[level]).collect();
     let text = vec![
-        Line::from(format!(" {} {}", name(row, model), model.signals.text(row))).style(style),
+        Line::from(format!(" {} {}", name(row, seen), seen.signals.text(row))).style(style),
         Line::from(line).style(style),
     ];
     frame.render_widget(Paragraph::new(text), area);

@@ -9,13 +9,15 @@ pub mod signals;
 pub mod statistics;
 pub mod trace;
 
+use cantap::wire::message::Mode;
 use ratatui::Frame;
 use ratatui::buffer::Buffer;
 use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::style::{Modifier, Style};
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
-use super::app::{App, PromptKind, View, source_text};
+use super::app::{App, PromptKind, View};
 use super::model::{Model, SourceState};
 use super::theme::Theme;
 
@@ -39,16 +41,23 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     .areas(area);
     frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
     frame.render_widget(Paragraph::new(state_line(app, model)), state);
+    // While the display is stopped, the pages show what was seen then.
+    let frozen = app.frozen.take();
+    let seen = frozen.as_deref().unwrap_or(&model.seen);
     match app.view {
         View::Trace => trace::draw(frame, body, app, model),
-        View::Fixed => fixed::draw(frame, body, app, model),
-        View::Signals => signals::draw(frame, body, app, model),
-        View::Graph => graph::draw(frame, body, app, model),
-        View::Statistics => statistics::draw(frame, body, app, model),
-        View::Send => send::draw(frame, body, app, model),
+        View::Fixed => fixed::draw(frame, body, app, model, seen),
+        View::Signals => signals::draw(frame, body, app, model, seen),
+        View::Graph => graph::draw(frame, body, app, seen),
+        View::Statistics => statistics::draw(frame, body, app, model, seen),
+        View::Send => send::draw(frame, body, app, seen),
         View::Record => record::draw(frame, body, app, model),
     }
-    frame.render_widget(Paragraph::new(bottom_line(app, model)).style(Theme::bar()), bottom);
+    app.frozen = frozen;
+    frame.render_widget(
+        Paragraph::new(bottom_line(app, model, usize::from(area.width))).style(Theme::bar()),
+        bottom,
+    );
     if app.help {
         help::draw(frame, area);
     }
@@ -83,7 +92,7 @@ fn tabs(app: &App) -> Line<'static> {
     let mut spans = vec![Span::raw(" ")];
     for (index, view) in View::ALL.into_iter().enumerate() {
         let text = format!("{}{}{} ", index + 1, if view == app.view { '▸' } else { ' ' }, view.title());
-        let style = if view == app.view { Theme::heading() } else { ratatui::style::Style::new() };
+        let style = if view == app.view { Theme::heading() } else { Style::new() };
         spans.push(Span::styled(text, style));
     }
     Line::from(spans)
@@ -102,37 +111,46 @@ pub fn tab_at(column: u16) -> Option<View> {
 fn state_line(app: &App, model: &Model) -> Line<'static> {
     let theme = app.theme;
     let source = app.plan.as_ref().map_or("file".to_owned(), |plan| {
-        let mode = if plan.mode.transmits() { "normal" } else { "listen-only" };
+        let mode = match plan.mode() {
+            Mode::ListenOnly => "listen-only",
+            Mode::Normal => "normal",
+            Mode::Loopback => "loopback",
+            Mode::SilentLoopback => "silent loopback",
+        };
         format!("{} {mode}", plan.address)
     });
     let style = match model.source {
         SourceState::Gone(_) => theme.error(),
         _ => theme.label(),
     };
-    let mut spans = vec![Span::styled(format!(" {source}: {}", source_text(model)), style)];
-    for (channel, windows) in &model.loads {
+    let mut spans = vec![Span::styled(format!(" {source}: {}", source_text(app, model)), style)];
+    if let Some((count, _)) = &model.unread {
+        spans.push(Span::styled(format!("  {count} unreadable"), theme.error()));
+    }
+    for (channel, windows) in &model.seen.loads {
         if let Some(load) = windows.back().and_then(|window| window.load_pct) {
             spans.push(Span::raw(format!("  {channel} ")));
             spans.push(Span::styled(format!("{load:.1} %"), theme.load(load)));
         }
     }
-    let lost: u64 = model.statistics.channels().iter().map(|channel| channel.losses.total()).sum();
-    if lost > 0 {
-        spans.push(Span::styled(format!("  lost {lost}"), theme.loss()));
+    let (lost, or_more) = model.seen.lost();
+    if lost > 0 || or_more {
+        let more = if or_more { "+" } else { "" };
+        spans.push(Span::styled(format!("  lost {lost}{more}"), theme.loss()));
     }
     if let Some(recording) = &model.recording {
         spans.push(Span::styled(format!("  REC {}", bytes(recording.bytes)), theme.error()));
     }
-    if app.paused {
+    if app.frozen.is_some() {
         spans.push(Span::styled("  PAUSED", Theme::heading()));
     }
-    if !model.filters.is_empty() {
+    if !model.history.filters().is_empty() {
         spans.push(Span::styled("  FILTER", Theme::heading()));
     }
     Line::from(spans)
 }
 
-fn bottom_line(app: &App, model: &Model) -> Line<'static> {
+fn bottom_line(app: &App, model: &Model, width: usize) -> Line<'static> {
     if let Some(prompt) = &app.prompt {
         let question = match prompt.kind {
             PromptKind::Search => "search",
@@ -145,13 +163,27 @@ fn bottom_line(app: &App, model: &Model) -> Line<'static> {
             PromptKind::Device => "device",
         };
         let said = if app.message.is_empty() { String::new() } else { format!("  ({})", app.message) };
-        return Line::from(format!(" {question}: {}_{said}", prompt.text));
+        let (before, behind) = prompt.line.halves();
+        let mut behind = behind.chars();
+        // The place is a block, and an underscore where there is nothing.
+        let place = behind.next().map_or("_".to_owned(), String::from);
+        return Line::from(vec![
+            Span::raw(format!(" {question}: {before}")),
+            Span::styled(place, Style::new().add_modifier(Modifier::REVERSED)),
+            Span::raw(format!("{}{said}", behind.as_str())),
+        ]);
     }
     if !app.message.is_empty() {
         return Line::from(format!(" {}", app.message));
     }
     if !model.notice.is_empty() {
         return Line::from(format!(" {}   (h help)", model.notice));
+    }
+    if let SourceState::Gone(reason) = &model.source {
+        return Line::from(format!(" {reason}   (h help)"));
+    }
+    if let (Some((count, first)), View::Statistics) = (&model.unread, app.view) {
+        return Line::from(format!(" {count} places could not be read and are left out, the first: {first}"));
     }
     let keys = match app.view {
         View::Trace => "t time  / search  n N next  y copy  ↑↓ scroll  End newest",
@@ -166,7 +198,40 @@ fn bottom_line(app: &App, model: &Model) -> Line<'static> {
         SourceState::Playing { .. } => "  , . speed  p stop  > step  l loop",
         _ => "",
     };
-    Line::from(format!(" h help  q quit  {keys}{playback}  Space pause  c clear"))
+    let all = format!("h help  q quit  {keys}{playback}  Space pause  c clear");
+    Line::from(format!(" {}", fitting(&all, width.saturating_sub(1))))
+}
+
+/// As many of the hints, which stand two blanks apart, as there is room for.
+fn fitting(hints: &str, width: usize) -> &str {
+    if hints.chars().count() <= width {
+        return hints;
+    }
+    let ends = hints.match_indices("  ").map(|(at, _)| at);
+    let end = ends.filter(|end| hints[..*end].chars().count() <= width).last().unwrap_or(0);
+    &hints[..end]
+}
+
+/// How the source is, in words for the second line.
+fn source_text(app: &App, model: &Model) -> String {
+    match &model.source {
+        SourceState::Starting => "connecting".to_owned(),
+        SourceState::Running => "running".to_owned(),
+        SourceState::Searching => "finding the bit rate".to_owned(),
+        SourceState::Gone(_) if app.plan.is_some() => "GONE, trying again".to_owned(),
+        SourceState::Gone(_) => "cannot be played".to_owned(),
+        SourceState::Playing { factor, paused, looped, ended } => {
+            let state = match (paused, ended) {
+                (_, true) => "ended",
+                (true, _) => "stopped",
+                _ => "playing",
+            };
+            let looped = if *looped { ", loop" } else { "" };
+            let speed =
+                if *factor == 0.0 { "as fast as can be".to_owned() } else { format!("delay ×{factor}") };
+            format!("{state}, {speed}{looped}")
+        }
+    }
 }
 
 /// A number of bytes for people.

@@ -21,7 +21,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             ),
         ],
         Some(recording) => {
-            let seconds = model.now_ns().saturating_sub(recording.since_ns) as f64 / 1e9;
+            let seconds = model.seen.now_ns().saturating_sub(recording.since_ns) as f64 / 1e9;
             let seconds = if recording.records == 0 { 0.0 } else { seconds.max(0.0) };
             vec![
                 Line::from(format!("Recording to {}", recording.path)).style(app.theme.error()),

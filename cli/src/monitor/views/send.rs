@@ -6,14 +6,14 @@ use ratatui::text::Line;
 use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
-use super::super::model::Model;
+use super::super::model::Seen;
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     let [state, body] = Layout::vertical([Constraint::Length(1), Constraint::Min(1)]).areas(area);
     let (text, style) = match &app.plan {
         None => ("A file sends nothing. Open a device with D.", app.theme.label()),
-        Some(plan) if plan.mode.transmits() => {
+        Some(plan) if plan.mode().transmits() => {
             ("Normal mode: what is sent here goes onto the bus.", app.theme.loss())
         }
         Some(_) => (
@@ -23,7 +23,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     };
     frame.render_widget(Paragraph::new(Line::styled(text, style)), state);
     if app.send.is_empty() {
-        let database = if model.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
+        let database = if seen.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
         let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");
         frame.render_widget(Paragraph::new(text), body);
         return;
@@ -36,7 +36,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             let period = entry.period.map_or("once".to_owned(), |period| format!("{period:?}"));
             format!(
                 "{} {} {:<24} {period:>10} {:>8}  {}",
-                if entry.on { "on" } else { "  " },
+                if entry.slot.is_some() { "on" } else { "  " },
                 entry.channel.number(),
                 entry.frame.to_string(),
                 entry.sent,

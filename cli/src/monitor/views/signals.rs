@@ -8,16 +8,19 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
-use super::super::model::{Model, SignalRow};
+use super::super::model::{Model, Seen, SignalRow};
 
 /// Columns of the small curve.
 const SPARK_COLUMNS: usize = 16;
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
-    let rows = model.signals.rows();
-    if rows.is_empty() {
-        let text = if model.signals.has_database() {
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
+    let rows = seen.signals.rows();
+    app.signal_order = (0..rows.len()).filter(|place| model.history.accepts(&rows[*place].last())).collect();
+    if app.signal_order.is_empty() {
+        let text = if !rows.is_empty() {
+            "The filter hides all signals; f changes it."
+        } else if seen.signals.has_database() {
             "No frame of the databases was seen yet."
         } else {
             "There is no signal database. Start with --db FILE, a DBC file or a .toml signal file."
@@ -31,23 +34,23 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
         "  C {:<name_columns$} {:>22} {:>10} {:>10} Past",
         "Signal", "Value", "Min", "Max"
     ));
-    super::list(frame, area, app, heading, rows.len(), |index, app| {
-        line(&rows[index], name_columns, app, model)
+    super::list(frame, area, app, heading, app.signal_order.len(), |index, app| {
+        line(&rows[app.signal_order[index]], name_columns, app, seen)
     });
 }
 
-fn line(row: &SignalRow, name_columns: usize, app: &App, model: &Model) -> Line<'static> {
+fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'static> {
     let theme = app.theme;
-    let signal = model.signals.signal(row);
-    let (arrow, style) = match model.signals.alarm(row) {
+    let signal = seen.signals.signal(row);
+    let (arrow, style) = match seen.signals.alarm(row) {
         Some(Alarm::Above) => (if theme.unicode { "▲" } else { "^" }, theme.error()),
         Some(Alarm::Below) => (if theme.unicode { "▼" } else { "v" }, theme.below()),
         None => (" ", Style::new()),
     };
-    let full = format!("{}.{}", model.signals.message_name(row), signal.name);
+    let full = format!("{}.{}", seen.signals.message_name(row), signal.name);
     let name = if full.chars().count() > name_columns { signal.name.clone() } else { full };
     let name: String = name.chars().take(name_columns).collect();
-    let value: String = model.signals.text(row).chars().take(22).collect();
+    let value: String = seen.signals.text(row).chars().take(22).collect();
     Line::from(vec![
         Span::raw(if row.chosen { "* " } else { "  " }),
         Span::raw(format!("{} {name:<name_columns$} ", row.channel)),

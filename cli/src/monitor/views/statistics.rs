@@ -8,7 +8,7 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
 use super::super::app::App;
-use super::super::model::{DeviceFigures, Model};
+use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
 use super::trace::{error_name, state_name};
 
@@ -25,30 +25,30 @@ const KINDS: [BusErrorKind; 6] = [
 ];
 
 /// Draws the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
     let mut lines = Vec::new();
     let width = usize::from(area.width);
-    let mut channels: Vec<_> = model.statistics.channels().iter().collect();
+    let mut channels: Vec<_> = seen.statistics.channels().iter().collect();
     channels.sort_by_key(|channel| channel.number);
     for channel in channels {
-        channel_lines(channel, width, app, model, &mut lines);
+        channel_lines(channel, width, app, seen, &mut lines);
         lines.push(Line::default());
     }
     if lines.is_empty() {
         lines.push(Line::from("Nothing was received yet."));
         lines.push(Line::default());
     }
-    if let Some(device) = &model.device {
+    if let Some(device) = &seen.device {
         device_lines(device, &mut lines);
     }
     let (used, most) = model.history.memory();
     lines.push(Line::from(format!(
-        "History   {} records, {} of {}",
-        model.history.end() - model.history.first(),
+        "Memory    {} of {} records, {} of {}",
+        model.history.len(),
+        seen.taken,
         super::bytes(used as u64),
         super::bytes(most as u64)
     )));
-    lines.push(Line::from(format!("Taken     {} records", model.taken)));
     app.page_rows = usize::from(area.height);
     // Scrolled with the arrows where the screen is small.
     let most = lines.len().saturating_sub(app.page_rows);
@@ -61,7 +61,7 @@ fn channel_lines(
     channel: &ChannelStatistics,
     width: usize,
     app: &App,
-    model: &Model,
+    seen: &Seen,
     lines: &mut Vec<Line<'static>>,
 ) {
     let theme = app.theme;
@@ -71,8 +71,7 @@ fn channel_lines(
     lines.push(
         Line::from(format!("Channel {}: {rate}{state}{counters}", channel.number)).style(Theme::heading()),
     );
-    let windows =
-        model.loads.iter().find(|(number, _)| *number == channel.number).map(|(_, windows)| windows);
+    let windows = seen.loads.iter().find(|(number, _)| *number == channel.number).map(|(_, windows)| windows);
     let latest = windows.and_then(|windows| windows.back());
     if let Some(load) = latest.and_then(|window| window.load_pct) {
         lines.push(gauge(load, GAUGE_COLUMNS[usize::from(width >= 110)], channel, app));

@@ -106,7 +106,7 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
         hex(frame.data()),
         printable(frame.data()),
     );
-    text.push_str(model.signals.name_of(record).unwrap_or_default());
+    text.push_str(model.seen.signals.name_of(record).unwrap_or_default());
     if late {
         text.push_str(" (or earlier)");
     }
@@ -208,7 +208,7 @@ pub fn find(model: &Model, cursor: Option<u64>, text: &str, direction: Direction
             return false;
         };
         record.frame().is_some_and(|frame| frame.to_string().contains(&compact))
-            || model.signals.name_of(record).is_some_and(|name| name.to_uppercase().contains(text))
+            || model.seen.signals.name_of(record).is_some_and(|name| name.to_uppercase().contains(text))
     };
     let from = cursor.unwrap_or(end);
     match direction {

@@ -3,12 +3,11 @@
 use std::time::Duration;
 
 use cantap::signals::encode;
-use cantap::wire::message::Mode;
 use cantap::{Channel, Frame};
 
-use super::app::{App, Prompt, PromptKind};
-use super::model::Model;
-use super::source::Order;
+use super::super::model::Model;
+use super::super::source::Order;
+use super::{App, Line, Prompt, PromptKind};
 
 /// A frame in the send list.
 #[derive(Clone, Debug, PartialEq)]
@@ -21,30 +20,18 @@ pub struct SendEntry {
     pub frame: Frame,
     /// How often; once per key without.
     pub period: Option<Duration>,
-    /// Whether the device sends it now.
-    pub on: bool,
+    /// The device's slot that sends it now, if one does.
+    pub slot: Option<u8>,
     /// How often it was sent by key.
     pub sent: u64,
 }
 
 impl App {
-    /// Between listen-only and normal.
-    pub(super) fn toggle_mode(&mut self) {
-        let Some(plan) = &mut self.plan else {
-            "a file has no mode".clone_into(&mut self.message);
-            return;
-        };
-        plan.mode = if plan.mode == Mode::ListenOnly { Mode::Normal } else { Mode::ListenOnly };
-        let plan = plan.clone();
-        self.send.iter_mut().for_each(|entry| entry.on = false);
-        self.order(Order::Open(plan));
-    }
-
     /// Whether frames can be sent; says why not.
     fn can_send(&mut self) -> bool {
         let reason = match &self.plan {
             None => "a file sends nothing; open a device with D",
-            Some(plan) if !plan.mode.transmits() => {
+            Some(plan) if !plan.mode().transmits() => {
                 "listen-only: nothing is sent; press m to take part in the bus"
             }
             Some(_) => return true,
@@ -68,60 +55,64 @@ impl App {
         if !self.can_send() {
             return;
         }
-        let Some(entry) = self.send.get_mut(self.selected) else {
-            return;
-        };
-        if entry.period.is_none() {
-            return self.send_once();
+        match self.send.get(self.selected) {
+            None => {}
+            Some(entry) if entry.period.is_none() => self.send_once(),
+            Some(entry) if entry.slot.is_some() => self.stop_periodic(self.selected),
+            Some(_) => self.start_periodic(self.selected),
         }
-        entry.on = !entry.on;
-        self.order_periodic(self.selected);
     }
 
-    fn order_periodic(&mut self, index: usize) {
-        let Some(entry) = self.send.get(index) else {
+    /// Lets the device send an entry periodically, in a slot of its own.
+    fn start_periodic(&mut self, place: usize) {
+        let Some(SendEntry { channel, frame, period: Some(period), .. }) = self.send.get(place).cloned()
+        else {
             return;
         };
-        let periodic = entry.period.filter(|_| entry.on).map(|period| (entry.frame, period));
-        let order = Order::SetPeriodic(entry.channel, index as u8, periodic);
-        self.order(order);
+        let in_use =
+            |slot| self.send.iter().any(|entry| (entry.channel, entry.slot) == (channel, Some(slot)));
+        let Some(slot) = (0..=u8::MAX).find(|slot| !in_use(*slot)) else {
+            "no device sends more frames periodically; stop another one".clone_into(&mut self.message);
+            return;
+        };
+        self.send[place].slot = Some(slot);
+        self.order(Order::SetPeriodic(channel, slot, Some((frame, period))));
     }
 
+    fn stop_periodic(&mut self, place: usize) {
+        if let Some(entry) = self.send.get_mut(place)
+            && let Some(slot) = entry.slot.take()
+        {
+            let order = Order::SetPeriodic(entry.channel, slot, None);
+            self.order(order);
+        }
+    }
+
+    /// Puts an entry at its place; what is sent periodically goes on as it is now.
     pub(super) fn put_entry(&mut self, place: Option<usize>, entry: SendEntry) {
-        match place.and_then(|place| self.send.get_mut(place)) {
-            Some(old) => {
-                let was_on = old.on;
-                *old = SendEntry { on: was_on && entry.period.is_some(), ..entry };
-                if was_on {
-                    self.order_periodic(place.unwrap_or_default());
-                }
-            }
-            None => self.send.push(entry),
+        let Some(place) = place.filter(|place| *place < self.send.len()) else {
+            self.send.push(entry);
+            return;
+        };
+        let (was_on, sent) = (self.send[place].slot.is_some(), self.send[place].sent);
+        self.stop_periodic(place);
+        self.send[place] = SendEntry { sent, ..entry };
+        if was_on {
+            self.start_periodic(place);
         }
     }
 
     pub(super) fn edit_entry(&mut self) {
         if let Some(entry) = self.send.get(self.selected) {
-            self.prompt =
-                Some(Prompt { kind: PromptKind::Send, text: entry.text.clone(), entry: Some(self.selected) });
+            let line = Line::new(&entry.text);
+            self.prompt = Some(Prompt { kind: PromptKind::Send, line, entry: Some(self.selected) });
         }
     }
 
     pub(super) fn delete_entry(&mut self) {
         if self.selected < self.send.len() {
-            // Slots are by place, so all behind it move.
-            let all_on: Vec<_> =
-                (self.selected..self.send.len()).filter(|place| self.send[*place].on).collect();
-            for place in all_on {
-                let order = Order::SetPeriodic(self.send[place].channel, place as u8, None);
-                self.order(order);
-            }
+            self.stop_periodic(self.selected);
             self.send.remove(self.selected);
-            for place in self.selected..self.send.len() {
-                if self.send[place].on {
-                    self.order_periodic(place);
-                }
-            }
         }
     }
 }
@@ -144,9 +135,9 @@ pub fn parse_entry(text: &str, model: &Model) -> Result<SendEntry, String> {
     } else {
         let number = channel.map(Channel::number);
         let encoded =
-            encode::encode(model.signals.decoder(), number, what).map_err(|error| error.to_string())?;
+            encode::encode(model.seen.signals.decoder(), number, what).map_err(|error| error.to_string())?;
         (encoded.frame, encoded.channel.and_then(Channel::from_number))
     };
     let channel = channel.or(of_database).unwrap_or(Channel::Can1);
-    Ok(SendEntry { text: text.to_owned(), channel, frame, period, on: false, sent: 0 })
+    Ok(SendEntry { text: text.to_owned(), channel, frame, period, slot: None, sent: 0 })
 }

@@ -1,0 +1,196 @@
+//! What keys and the mouse do.
+
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
+
+use super::super::model::Model;
+use super::super::source::Order;
+use super::super::views::{self, trace};
+use super::{App, Flow, PromptKind, View};
+
+/// The row where a page's own rows begin, its heading.
+const BODY_ROW: u16 = 2;
+/// Rows that one step of the wheel scrolls.
+const WHEEL_ROWS: usize = 3;
+
+impl App {
+    /// A key was pressed.
+    pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
+        self.message.clear();
+        // Whoever presses a key has read it.
+        model.notice.clear();
+        if key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) {
+            return self.key_with_control(key);
+        }
+        if self.prompt.is_some() {
+            self.prompt_key(key.code, model);
+            return Flow::GoOn;
+        }
+        if self.help {
+            self.help = false;
+            return if key.code == KeyCode::Char('q') { Flow::Quit } else { Flow::GoOn };
+        }
+        match key.code {
+            KeyCode::Char('q') => return Flow::Quit,
+            KeyCode::Char('h' | '?') | KeyCode::F(1) => self.help = true,
+            KeyCode::Char(digit @ '1'..='7') => self.show(View::ALL[digit as usize - '1' as usize]),
+            KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
+            KeyCode::BackTab => {
+                self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
+            }
+            KeyCode::Char(' ') if self.view == View::Send => self.toggle_sending(),
+            KeyCode::Char(' ') => self.pause(model),
+            KeyCode::Char('c') => self.clear(model),
+            KeyCode::Char('t') => self.time_mode = self.time_mode.next(),
+            KeyCode::Char('/') => {
+                self.show(View::Trace);
+                self.ask(PromptKind::Search, "");
+            }
+            KeyCode::Char('f') => {
+                let filters: Vec<_> = model.history.filters().iter().map(ToString::to_string).collect();
+                self.ask(PromptKind::Filter, &filters.join(" "));
+            }
+            KeyCode::Char('r') if model.recording.is_some() => self.order(Order::StopRecording),
+            KeyCode::Char('r') => self.ask(PromptKind::Record, ""),
+            KeyCode::Char('b') => self.ask_bit_rate(model),
+            KeyCode::Char('A') if self.plan.is_some() => self.order(Order::Autobaud),
+            KeyCode::Char('A') => "a file has no bit rate to be found".clone_into(&mut self.message),
+            KeyCode::Char('D') => {
+                let address =
+                    self.plan.as_ref().map_or("virtual".to_owned(), |plan| plan.address.to_string());
+                self.ask(PromptKind::Device, &address);
+            }
+            KeyCode::Char('m') => self.toggle_mode(),
+            KeyCode::Char(',') => self.order(Order::Slower),
+            KeyCode::Char('.') => self.order(Order::Faster),
+            KeyCode::Char('p') => self.order(Order::TogglePause),
+            KeyCode::Char('>') => self.order(Order::Step),
+            KeyCode::Char('l') => self.order(Order::ToggleLoop),
+            code => self.page_key(code, model),
+        }
+        Flow::GoOn
+    }
+
+    /// A key with Control, which a plain letter's meaning must not get.
+    fn key_with_control(&mut self, key: KeyEvent) -> Flow {
+        match (key.code, &mut self.prompt) {
+            (KeyCode::Char('c'), _) => return Flow::Quit,
+            (KeyCode::Char('z'), _) => return Flow::Suspend,
+            (KeyCode::Char('u'), Some(prompt)) => prompt.line.clear(),
+            _ => {}
+        }
+        Flow::GoOn
+    }
+
+    /// Keys that mean something on this page only.
+    fn page_key(&mut self, code: KeyCode, model: &mut Model) {
+        match (self.view, code) {
+            (View::Trace, KeyCode::Char('n')) => self.find(model, trace::Direction::Back),
+            (View::Trace, KeyCode::Char('N')) => self.find(model, trace::Direction::Forward),
+            (View::Trace, KeyCode::Char('y')) => self.copy(model),
+            (View::Trace, code) => self.scroll_trace(code, model),
+            (View::Fixed, KeyCode::Char('s')) => self.sort = self.sort.next(),
+            (View::Fixed, KeyCode::Char('S')) => self.reverse = !self.reverse,
+            (View::Fixed, KeyCode::Char('g')) => self.grouped = !self.grouped,
+            (View::Fixed, KeyCode::Char('H')) => self.heat = !self.heat,
+            (View::Fixed, KeyCode::Char('#')) => self.each_seen(model, |seen| seen.table.notch()),
+            (View::Fixed, KeyCode::Char('*')) => self.each_seen(model, |seen| seen.table.unnotch()),
+            (View::Fixed, KeyCode::Char('u')) => self.each_seen(model, |seen| seen.table.unhide()),
+            (View::Fixed, KeyCode::Char(key @ ('x' | 'o'))) => self.mark_row(key == 'x', model),
+            (View::Signals, KeyCode::Enter) => {
+                if let Some(row) = self.signal_order.get(self.selected).copied() {
+                    self.each_seen(model, |seen| seen.signals.toggle(row));
+                }
+            }
+            (View::Graph, KeyCode::Char('+') | KeyCode::Up) => {
+                self.graph_span = (self.graph_span / 2.0).max(0.1);
+            }
+            (View::Graph, KeyCode::Char('-') | KeyCode::Down) => {
+                self.graph_span = (self.graph_span * 2.0).min(600.0);
+            }
+            (View::Graph, KeyCode::Left) => self.move_graph_cursor(-0.02),
+            (View::Graph, KeyCode::Right) => self.move_graph_cursor(0.02),
+            (View::Graph, KeyCode::Esc) => self.graph_cursor = None,
+            (View::Send, KeyCode::Enter) => self.send_once(),
+            (View::Send, KeyCode::Char('a')) => self.ask(PromptKind::Send, ""),
+            (View::Send, KeyCode::Char('e')) => self.edit_entry(),
+            (View::Send, KeyCode::Char('d') | KeyCode::Delete) => self.delete_entry(),
+            (_, code) => self.scroll(code),
+        }
+    }
+
+    /// Hides the selected row of the fixed view, or gives it the next colour.
+    fn mark_row(&mut self, hide: bool, model: &mut Model) {
+        let Some((channel, id)) = self.fixed_order.get(self.selected).copied() else {
+            return;
+        };
+        self.each_seen(model, |seen| {
+            if let Some(row) = seen.table.row_mut(channel, id) {
+                if hide {
+                    row.hidden = true;
+                } else {
+                    row.mark = (row.mark + 1) % 7;
+                }
+            }
+        });
+    }
+
+    fn copy(&mut self, model: &Model) {
+        let place = self.cursor.or(model.history.end().checked_sub(1));
+        self.clipboard = place.and_then(|place| trace::candump_line(model, place));
+        let said = if self.clipboard.is_some() { "copied" } else { "this is no frame; nothing was copied" };
+        said.clone_into(&mut self.message);
+    }
+
+    fn move_graph_cursor(&mut self, by: f64) {
+        self.graph_cursor = Some((self.graph_cursor.unwrap_or(1.0) + by).clamp(0.0, 1.0));
+    }
+
+    /// The mouse was used.
+    pub fn mouse(&mut self, event: MouseEvent, model: &mut Model) {
+        let code = match event.kind {
+            MouseEventKind::ScrollUp => KeyCode::Up,
+            MouseEventKind::ScrollDown => KeyCode::Down,
+            MouseEventKind::Down(MouseButton::Left) => {
+                if self.prompt.is_none() && !self.help {
+                    self.click(event, model);
+                }
+                return;
+            }
+            _ => return,
+        };
+        if self.prompt.is_none() && !self.help {
+            // On the graph, a step of the wheel is a step of the zoom.
+            for _ in 0..if self.view == View::Graph { 1 } else { WHEEL_ROWS } {
+                self.page_key(code, model);
+            }
+        }
+    }
+
+    fn click(&mut self, event: MouseEvent, model: &Model) {
+        if event.row == 0 {
+            if let Some(view) = views::tab_at(event.column) {
+                self.show(view);
+            }
+            return;
+        }
+        // The page begins with a heading; the send list's stands below a sentence.
+        let first_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
+        let Some(row) = event.row.checked_sub(first_row).map(usize::from).filter(|row| *row < self.page_rows)
+        else {
+            return;
+        };
+        match self.view {
+            View::Fixed | View::Signals | View::Send => {
+                self.selected = views::first_row(self.selected, self.page_rows) + row;
+            }
+            View::Trace => {
+                let top = self.bottom.saturating_sub(self.page_rows as u64).max(model.history.first());
+                let place = top + row as u64;
+                if place < self.bottom {
+                    self.cursor = Some(place);
+                }
+            }
+            View::Graph | View::Statistics | View::Record => {}
+        }
+    }
+}

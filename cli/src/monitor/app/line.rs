@@ -1,0 +1,80 @@
+//! A line of text that is being typed.
+
+use ratatui::crossterm::event::KeyCode;
+
+/// Text with a place in it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Line {
+    text: Vec<char>,
+    place: usize,
+}
+
+impl Line {
+    /// This text, to be continued at its end.
+    pub fn new(text: &str) -> Self {
+        let text: Vec<char> = text.chars().collect();
+        Self { place: text.len(), text }
+    }
+
+    /// What stands there.
+    pub fn text(&self) -> String {
+        self.text.iter().collect()
+    }
+
+    /// What stands before the place, and from it on.
+    pub fn halves(&self) -> (String, String) {
+        let (before, behind) = self.text.split_at(self.place);
+        (before.iter().collect(), behind.iter().collect())
+    }
+
+    /// Empties it.
+    pub fn clear(&mut self) {
+        *self = Self::default();
+    }
+
+    /// A key that edits; others do nothing.
+    pub fn key(&mut self, code: KeyCode) {
+        match code {
+            KeyCode::Char(character) => {
+                self.text.insert(self.place, character);
+                self.place += 1;
+            }
+            KeyCode::Backspace if self.place > 0 => {
+                self.place -= 1;
+                self.text.remove(self.place);
+            }
+            KeyCode::Delete if self.place < self.text.len() => {
+                self.text.remove(self.place);
+            }
+            KeyCode::Left => self.place = self.place.saturating_sub(1),
+            KeyCode::Right => self.place = (self.place + 1).min(self.text.len()),
+            KeyCode::Home => self.place = 0,
+            KeyCode::End => self.place = self.text.len(),
+            _ => {}
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_is_edited_where_the_cursor_stands() {
+        let mut line = Line::new("12ä#11");
+        for code in [KeyCode::Left, KeyCode::Left, KeyCode::Left, KeyCode::Backspace, KeyCode::Char('3')] {
+            line.key(code);
+        }
+        assert_eq!(line.halves(), ("123".to_owned(), "#11".to_owned()));
+        line.key(KeyCode::Home);
+        line.key(KeyCode::Backspace);
+        line.key(KeyCode::Delete);
+        line.key(KeyCode::End);
+        line.key(KeyCode::Delete);
+        line.key(KeyCode::Right);
+        line.key(KeyCode::Char('!'));
+        assert_eq!(line.text(), "23#11!");
+        line.clear();
+        assert_eq!(line, Line::default());
+    }
+}

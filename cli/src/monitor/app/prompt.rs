@@ -1,0 +1,100 @@
+//! Lines of input: what is asked for, and what becomes of the answer.
+
+use std::path::PathBuf;
+
+use cantap::filter::Filter;
+use ratatui::crossterm::event::KeyCode;
+
+use super::super::model::Model;
+use super::super::source::Order;
+use super::super::views::trace;
+use super::{App, Line, parse_entry};
+
+/// What a line of input is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PromptKind {
+    /// Text to look for in the trace.
+    Search,
+    /// Filters in candump's syntax.
+    Filter,
+    /// A file to record to.
+    Record,
+    /// A frame or message to send, with its period.
+    Send,
+    /// Bit rates.
+    BitRate,
+    /// A device.
+    Device,
+}
+
+/// A line of input.
+#[derive(Clone, Debug)]
+pub struct Prompt {
+    /// What for.
+    pub kind: PromptKind,
+    /// What was typed.
+    pub line: Line,
+    /// The entry of the send list that it edits.
+    pub entry: Option<usize>,
+}
+
+impl App {
+    pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {
+        match (code, &mut self.prompt) {
+            (KeyCode::Esc, _) => self.prompt = None,
+            (KeyCode::Enter, prompt) => {
+                if let Some(prompt) = prompt.take() {
+                    self.answer(prompt, model);
+                }
+            }
+            (code, Some(prompt)) => prompt.line.key(code),
+            (_, None) => {}
+        }
+    }
+
+    /// A line was typed. What is wrong with it is said, and the line stays open.
+    fn answer(&mut self, prompt: Prompt, model: &mut Model) {
+        let line = prompt.line.text();
+        let text = line.trim();
+        let result = match prompt.kind {
+            PromptKind::Search => {
+                self.search = text.to_uppercase();
+                if !text.is_empty() {
+                    self.find(model, trace::Direction::Back);
+                }
+                Ok(())
+            }
+            PromptKind::Filter => self.set_filters(text, model),
+            PromptKind::Record | PromptKind::Send if text.is_empty() => Ok(()),
+            PromptKind::Record => {
+                self.order(Order::Record(PathBuf::from(text)));
+                Ok(())
+            }
+            PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
+            PromptKind::BitRate => self.set_bit_rates(text, model),
+            PromptKind::Device => self.set_device(text, model),
+        };
+        if let Err(reason) = result {
+            self.message = reason;
+            self.prompt = Some(prompt);
+        }
+    }
+
+    fn set_filters(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
+        let filters =
+            text.split_whitespace().map(|part| part.parse::<Filter>().map_err(|error| error.to_string()));
+        let filters = filters.collect::<Result<Vec<_>, _>>()?;
+        self.cursor = model.history.set_filters(filters, self.cursor);
+        Ok(())
+    }
+
+    pub(super) fn find(&mut self, model: &Model, direction: trace::Direction) {
+        if self.search.is_empty() {
+            return self.ask(PromptKind::Search, "");
+        }
+        match trace::find(model, self.cursor, &self.search, direction) {
+            Some(place) => self.cursor = Some(place),
+            None => self.message = format!("'{}' is not there", self.search),
+        }
+    }
+}

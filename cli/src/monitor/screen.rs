@@ -1,0 +1,157 @@
+//! The terminal in our hands: taken, given back however we leave, and never waited for with the model locked.
+
+use std::cell::RefCell;
+use std::io::{IsTerminal, Write};
+use std::rc::Rc;
+
+use anyhow::bail;
+use ratatui::Terminal;
+use ratatui::backend::CrosstermBackend;
+use ratatui::crossterm::event::{DisableMouseCapture, EnableMouseCapture};
+use ratatui::crossterm::execute;
+use ratatui::crossterm::terminal::{
+    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+};
+
+use super::app::App;
+use super::model::Model;
+use super::source::{Shared, lock};
+use super::views;
+
+/// The terminal, taken; dropping it gives it back.
+pub struct Screen {
+    terminal: Terminal<CrosstermBackend<Page>>,
+    page: Page,
+}
+
+/// What is to be written. Drawing needs the model, whose lock must not be held while a slow terminal takes its time.
+#[derive(Clone, Default)]
+struct Page(Rc<RefCell<Vec<u8>>>);
+
+impl Write for Page {
+    fn write(&mut self, bytes: &[u8]) -> std::io::Result<usize> {
+        self.0.borrow_mut().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> std::io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Screen {
+    /// Refuses what is no terminal with what to do instead, and takes it otherwise.
+    pub fn enter() -> anyhow::Result<Self> {
+        const INSTEAD: &str = "use --once for one screen, or `cantap capture` and `cantap stats`";
+        if !std::io::stdout().is_terminal() || !std::io::stdin().is_terminal() {
+            bail!("the live view needs a terminal; {INSTEAD}");
+        }
+        if cfg!(unix) && matches!(std::env::var("TERM").as_deref(), Ok("" | "dumb")) {
+            bail!(
+                "the live view needs a terminal that can move its cursor, and TERM says it cannot; {INSTEAD}"
+            );
+        }
+        let page = Page::default();
+        let terminal = Terminal::new(CrosstermBackend::new(page.clone()))?;
+        let before = std::panic::take_hook();
+        // A panic's message must not be lost with the alternate screen.
+        std::panic::set_hook(Box::new(move |info| {
+            give_back();
+            before(info);
+        }));
+        let screen = Self { terminal, page };
+        take()?;
+        Ok(screen)
+    }
+
+    /// Draws the page that the user looks at.
+    pub fn draw(&mut self, app: &mut App, model: &Shared) -> anyhow::Result<()> {
+        {
+            let mut model = lock(model);
+            app.catch_up(&mut model);
+            self.render(app, &model)?;
+        }
+        let mut out = std::io::stdout();
+        out.write_all(&self.page.0.borrow())?;
+        self.page.0.borrow_mut().clear();
+        Ok(out.flush()?)
+    }
+
+    fn render(&mut self, app: &mut App, model: &Model) -> anyhow::Result<()> {
+        self.terminal.draw(|frame| views::draw(frame, app, model))?;
+        Ok(())
+    }
+
+    /// Stops the program until the shell lets it go on, with the terminal as it was.
+    #[cfg(unix)]
+    pub fn suspend(&mut self) -> anyhow::Result<()> {
+        give_back();
+        signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGTSTP)?;
+        take()?;
+        Ok(self.terminal.clear()?)
+    }
+
+    /// There is no such thing on this system.
+    #[cfg(not(unix))]
+    pub fn suspend(&mut self) -> anyhow::Result<()> {
+        Ok(())
+    }
+}
+
+impl Drop for Screen {
+    fn drop(&mut self) {
+        give_back();
+    }
+}
+
+fn take() -> anyhow::Result<()> {
+    enable_raw_mode()?;
+    Ok(execute!(std::io::stdout(), EnterAlternateScreen, EnableMouseCapture)?)
+}
+
+fn give_back() {
+    // There is nobody left to tell if that fails. The cursor was hidden by the first drawing.
+    let _ = execute!(
+        std::io::stdout(),
+        DisableMouseCapture,
+        LeaveAlternateScreen,
+        ratatui::crossterm::cursor::Show
+    );
+    let _ = disable_raw_mode();
+}
+
+/// Puts text into the clipboard through the terminal (xterm's OSC 52), which works over a network too.
+pub fn copy(text: &str) -> std::io::Result<()> {
+    let mut out = std::io::stdout();
+    write!(out, "\x1b]52;c;{}\x07", base64(text.as_bytes()))?;
+    out.flush()
+}
+
+fn base64(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+    let mut encoded = String::new();
+    for piece in bytes.chunks(3) {
+        let bits =
+            piece.iter().chain([0, 0].iter()).take(3).fold(0u32, |bits, byte| bits << 8 | u32::from(*byte));
+        for digit in 0..4 {
+            let value = bits >> (18 - 6 * digit) & 63;
+            encoded.push(if digit <= piece.len() { DIGITS[value as usize] as char } else { '=' });
+        }
+    }
+    encoded
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// RFC 4648, section 10.
+    #[test]
+    fn base64_is_as_the_rfc_has_it() {
+        for (text, encoded) in
+            [("", ""), ("f", "Zg=="), ("fo", "Zm8="), ("foo", "Zm9v"), ("foobar", "Zm9vYmFy")]
+        {
+            assert_eq!(base64(text.as_bytes()), encoded);
+        }
+    }
+}

@@ -1,0 +1,81 @@
+//! Bit rates found by listening, with progress; it can be stopped at any time.
+
+use std::sync::mpsc::TryRecvError;
+
+use cantap::Device;
+use cantap::autobaud::{self, Limits, Outcome, Progress};
+
+use super::super::model::SourceState;
+use super::{Plan, Source, Then, lock};
+use crate::channel_bitrate::ChannelBitrate;
+
+impl Source<'_> {
+    /// Puts the bit rates that are found into the plan; what is not found stays as it was. Says what is to be done
+    /// after it: an order may have come meanwhile.
+    pub(super) fn autobaud(&mut self, plan: &mut Plan) -> Then {
+        let device = match Device::open(&plan.address) {
+            Ok(device) => device,
+            Err(error) => {
+                self.notice(error.to_string());
+                return Then::GoOn;
+            }
+        };
+        lock(self.model).source = SourceState::Searching;
+        let mut said = Vec::new();
+        let mut rates = Vec::new();
+        let mut then = Then::GoOn;
+        for channel in &plan.channels {
+            let number = channel.number();
+            let mut progress = |progress: Progress| {
+                self.notice(format!("channel {number}: {}; A stops", describe(progress)));
+                then = self.order_meanwhile();
+                matches!(then, Then::GoOn)
+            };
+            said.push(match autobaud::search(&device, *channel, &Limits::default(), &mut progress) {
+                Ok(Outcome::Found { bitrate_bps, .. }) => {
+                    rates.push(ChannelBitrate { channel: Some(number), bitrate_bps });
+                    format!("channel {number}: {bitrate_bps} bit/s")
+                }
+                Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
+                Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
+                Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
+                Err(error) => format!("channel {number}: {error}"),
+            });
+            if !matches!(then, Then::GoOn) {
+                break;
+            }
+        }
+        if !rates.is_empty() {
+            // Behind the others: the last one counts.
+            rates.splice(0..0, plan.open.timing.bitrates.clone());
+            plan.open.timing.set_bit_rates(rates);
+            lock(self.model).found = Some(plan.clone());
+        }
+        self.notice(said.join("; "));
+        then
+    }
+
+    /// What was ordered during the search; anything that concerns the device ends it.
+    fn order_meanwhile(&mut self) -> Then {
+        loop {
+            match self.orders.try_recv() {
+                Ok(order) => match self.follow(order) {
+                    Then::GoOn => {}
+                    then => return then,
+                },
+                Err(TryRecvError::Empty) => return Then::GoOn,
+                Err(TryRecvError::Disconnected) => return Then::Quit,
+            }
+        }
+    }
+}
+
+fn describe(progress: Progress) -> String {
+    match progress {
+        Progress::Common { bitrate_bps, at, of } => {
+            format!("common rates {}/{of}, {bitrate_bps} bit/s", at + 1)
+        }
+        Progress::Scan { bitrate_bps, at, of } => format!("all rates {}/{of}, {bitrate_bps} bit/s", at + 1),
+        Progress::Checking { bitrate_bps } => format!("frames at {bitrate_bps} bit/s, making sure"),
+    }
+}

@@ -22,6 +22,7 @@ use crate::interrupt;
                         seed=N           another sequence of frames (1)\n  \
                         settings=FILE    where the device keeps what it saves, over a power cycle\n  \
                         pace=real|fast   real time, or as fast as the host reads (real)\n  \
+                        serial=NAME      the serial number that it tells (VIRTUAL)\n  \
                         log=FILE         replay a trace file at its own times; must come last\n\n\
                         The same options follow `virtual:` wherever a device is asked for.\n\n\
                         Examples:\n  cantap virtual load=100,frames=std0\n  cantap virtual bitrate=250k,log=drive.log")]

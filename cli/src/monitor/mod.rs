@@ -42,7 +42,7 @@ pub fn run(
     let mut screen = Screen::enter()?;
     let model: Shared = Arc::new(Mutex::new(model));
     let thread = start(origin, &model, orders)?;
-    let result = display(&mut screen, &mut app, &model);
+    let result = display(&mut screen, &mut app, &model, || thread.is_finished());
     drop(screen);
     // The source ends the recording properly before it goes.
     let _ = app.orders.send(Order::Quit);
@@ -66,9 +66,15 @@ fn start(
     std::thread::Builder::new().name("cantap-source".to_owned()).spawn(body)
 }
 
-fn display(screen: &mut Screen, app: &mut App, model: &Shared) -> anyhow::Result<()> {
+/// Until the user leaves, a signal asks for it, or there is no source any more.
+fn display(
+    screen: &mut Screen,
+    app: &mut App,
+    model: &Shared,
+    is_over: impl Fn() -> bool,
+) -> anyhow::Result<()> {
     let stops = Stops::watch()?;
-    while !interrupt::requested() {
+    while !interrupt::requested() && !is_over() {
         let drawn = Instant::now();
         screen.draw(app, model)?;
         let mut flow = if stops.asked() { Flow::Suspend } else { Flow::GoOn };

@@ -10,7 +10,7 @@ use ratatui::backend::CrosstermBackend;
 use ratatui::crossterm::event::{DisableMouseCapture, EnableMouseCapture};
 use ratatui::crossterm::execute;
 use ratatui::crossterm::terminal::{
-    EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+    Clear, ClearType, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
 
 use super::app::App;
@@ -88,7 +88,9 @@ impl Screen {
         give_back();
         signal_hook::low_level::emulate_default_handler(signal_hook::consts::SIGTSTP)?;
         take()?;
-        Ok(self.terminal.clear()?)
+        // Nothing of what was drawn before is there any more.
+        self.terminal = Terminal::new(CrosstermBackend::new(self.page.clone()))?;
+        Ok(execute!(std::io::stdout(), Clear(ClearType::All))?)
     }
 
     /// There is no such thing on this system.
@@ -153,5 +155,39 @@ mod tests {
         {
             assert_eq!(base64(text.as_bytes()), encoded);
         }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    #[ignore = "the next test runs it in a terminal of its own"]
+    fn a_display_that_panics() {
+        let _screen = Screen::enter().unwrap();
+        panic!("on purpose");
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_panic_gives_the_terminal_back_and_its_message_stays() {
+        use std::io::Read;
+
+        let pair = portable_pty::native_pty_system().openpty(portable_pty::PtySize::default()).unwrap();
+        let mut command = portable_pty::CommandBuilder::new(std::env::current_exe().unwrap());
+        command.args(["--ignored", "--nocapture", "monitor::screen::tests::a_display_that_panics"]);
+        command.env("TERM", "xterm");
+        let mut child = pair.slave.spawn_command(command).unwrap();
+        drop(pair.slave);
+        let (mut reader, mut output) = (pair.master.try_clone_reader().unwrap(), Vec::new());
+        // Ends with an error when the child has closed its terminal.
+        let _ = reader.read_to_end(&mut output);
+        child.wait().unwrap();
+        let mut terminal = vt100::Parser::default();
+        terminal.process(&output);
+        let screen = terminal.screen();
+        assert!(String::from_utf8_lossy(&output).contains("\x1b[?1049h"));
+        assert!(!screen.alternate_screen() && !screen.hide_cursor());
+        assert_eq!(screen.mouse_protocol_mode(), vt100::MouseProtocolMode::None);
+        assert!(screen.contents().contains("on purpose"), "{}", screen.contents());
+        let local = format!("{:?}", pair.master.get_termios().unwrap().local_flags);
+        assert!(local.contains("ICANON") && local.contains("ECHO"), "{local}");
     }
 }

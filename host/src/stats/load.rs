@@ -18,7 +18,8 @@ const LONGEST_FRAME_BITS: u64 = 160;
 /// Nanoseconds that `bits` take, rounded to the nearest.
 pub(super) fn bits_to_ns(bits: u64, bitrate_bps: u32) -> u64 {
     let bitrate = u64::from(bitrate_bps);
-    (bits * 1_000_000_000 + bitrate / 2) / bitrate
+    // A file may say anything about suppressed errors.
+    bits.saturating_mul(1_000_000_000).saturating_add(bitrate / 2) / bitrate
 }
 
 /// The shortest window that a frame cannot outlast at this bit rate, in nanoseconds.
@@ -284,7 +285,8 @@ impl Windows {
     pub(super) fn errors(&mut self, count: u64) {
         self.current.errors += count;
         if let Some(bitrate) = self.bitrate_bps {
-            self.current.busy_ns += bits_to_ns(count * u64::from(ERROR_FRAME_BITS), bitrate);
+            let busy_ns = bits_to_ns(count * u64::from(ERROR_FRAME_BITS), bitrate);
+            self.current.busy_ns = self.current.busy_ns.saturating_add(busy_ns);
         }
     }
 

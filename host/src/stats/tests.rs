@@ -161,6 +161,17 @@ fn no_time_however_wild_makes_it_panic() {
     }
     statistics.finish();
     assert_eq!(statistics.summary().frames, 16);
+    // Nor any count.
+    for event in [
+        TraceEvent::ErrorsSuppressed { count: u32::MAX },
+        TraceEvent::Lost { stage: None, count: u32::MAX, at_least: true },
+    ] {
+        for time_us in 0..20_000 {
+            statistics.push(&at(time_us, 3, event));
+        }
+    }
+    statistics.push(&frame(20_000, 3, "000#55"));
+    statistics.finish();
 }
 
 #[test]

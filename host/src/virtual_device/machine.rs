@@ -101,8 +101,8 @@ impl<'q> Machine<'q> {
         let (producer, consumer) = queue.split();
         let identity = Identity {
             board: "virtual",
-            // Cannot fail: it is short.
-            serial: heapless::String::try_from("VIRTUAL").unwrap_or_default(),
+            // Cannot fail: longer ones are refused.
+            serial: heapless::String::try_from(options.serial.as_str()).unwrap_or_default(),
         };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {

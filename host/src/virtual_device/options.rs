@@ -10,6 +10,9 @@ use cantap_wire::{CHANNELS, Frame};
 
 use crate::simbus::{FrameSource, Frames, Schedule, SimBus, Traffic};
 
+/// As long as a serial number can be.
+const MAX_SERIAL_BYTES: usize = 24;
+
 /// How model time passes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum Pace {
@@ -25,8 +28,10 @@ pub enum Pace {
 /// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `load` (per cent), `frames` (`std0` `std8` `ext0`
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
 /// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (so many of the frames that the device
-/// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device saves), `pace` (`real`, `fast`), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `channels` (`1`, `2` or `both`:
-/// those with traffic), and at the end `log=FILE` (a trace file, replayed at its own times).
+/// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device
+/// saves), `serial` (the serial number that it tells), `pace` (`real`, `fast`), `wire` (`apart`: a bus for each channel;
+/// `joined`: one bus for both), `channels` (`1`, `2` or `both`: those with traffic), and at the end `log=FILE` (a trace
+/// file, replayed at its own times).
 #[derive(Clone, Debug, PartialEq)]
 pub struct Options {
     /// Bus load in per cent, 0 to 100.
@@ -53,6 +58,8 @@ pub struct Options {
     pub joined: bool,
     /// Which channels' buses have traffic.
     pub traffic_on: [bool; CHANNELS],
+    /// The serial number that the device tells, at most 24 bytes.
+    pub serial: String,
     /// Frames to be replayed at their own times (nanoseconds since the start), in place of made-up ones, per channel.
     pub log: Option<[Vec<(u64, Frame)>; CHANNELS]>,
 }
@@ -72,6 +79,7 @@ impl Default for Options {
             pace: Pace::RealTime,
             joined: false,
             traffic_on: [true; CHANNELS],
+            serial: "VIRTUAL".to_owned(),
             log: None,
         }
     }
@@ -82,7 +90,7 @@ impl Default for Options {
 pub enum BadOption {
     /// There is no such key.
     #[error(
-        "there is no option '{0}'; there are load, frames, bitrate, burst, errors, disturb, ack, seed, settings, pace, wire, channels, log"
+        "there is no option '{0}'; there are load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, pace, wire, channels, log"
     )]
     Unknown(String),
     /// The value does not fit.
@@ -167,6 +175,8 @@ impl Options {
                     _ => return Err(bad(&"give 1, 2 or both")),
                 };
             }
+            "serial" if (1..=MAX_SERIAL_BYTES).contains(&value.len()) => value.clone_into(&mut self.serial),
+            "serial" => return Err(bad(&"give 1 to 24 characters")),
             _ => return Err(BadOption::Unknown(key.to_owned())),
         }
         Ok(())
@@ -232,7 +242,7 @@ mod tests {
     #[test]
     fn options_are_read_and_bad_ones_say_what_would_fit() {
         let options: Options =
-            "load=100,frames=std0,bitrate=500k,burst=10/960us,ack=no,pace=fast".parse().unwrap();
+            "load=100,frames=std0,bitrate=500k,burst=10/960us,ack=no,pace=fast,serial=A1".parse().unwrap();
         assert_eq!(
             options,
             Options {
@@ -242,6 +252,7 @@ mod tests {
                 burst: Some((10, Duration::from_micros(960))),
                 acknowledge: false,
                 pace: Pace::Fast,
+                serial: "A1".to_owned(),
                 ..Options::default()
             }
         );
@@ -249,6 +260,7 @@ mod tests {
             ("speed=1", "there is no option 'speed'"),
             ("load=101", "'101' does not fit the option 'load': give per cent, 0 to 100"),
             ("frames=x", "'x' does not fit the option 'frames': choose one of std0"),
+            ("serial=", "'' does not fit the option 'serial': give 1 to 24 characters"),
             ("bitrate=2M", "'2M' does not fit the option 'bitrate': give 5k to 1M"),
         ] {
             let error = text.parse::<Options>().unwrap_err().to_string();

@@ -18,6 +18,11 @@ impl App {
         self.message.clear();
         // Whoever presses a key has read it.
         model.notice.clear();
+        let key = match (key.code, key.modifiers) {
+            // So arrives an Enter that was typed before the terminal was ours, or pasted.
+            (KeyCode::Char('j'), KeyModifiers::CONTROL) => KeyEvent::from(KeyCode::Enter),
+            _ => key,
+        };
         if key.modifiers.intersects(KeyModifiers::CONTROL | KeyModifiers::ALT) {
             return self.key_with_control(key);
         }

@@ -58,7 +58,7 @@ impl App {
         let text = line.trim();
         let result = match prompt.kind {
             PromptKind::Search => {
-                self.search = text.to_uppercase();
+                self.search = text.to_ascii_uppercase();
                 if !text.is_empty() {
                     self.find(model, trace::Direction::Back);
                 }

@@ -28,8 +28,8 @@ pub struct Row {
     pub jitter_ns: f64,
     /// Bits in which the last frame differs from the one before; the first byte is on top.
     pub changed: u64,
-    /// When each byte last changed.
-    pub changed_ns: [i64; 8],
+    /// When each hexadecimal digit last changed; the first byte's upper one is the first.
+    pub changed_ns: [i64; 16],
     /// How often each bit changed; the first byte's highest bit is the first.
     pub heat: Box<[u32; 64]>,
     /// Bits whose changes are not shown.
@@ -53,7 +53,7 @@ impl Row {
             period_ns: None,
             jitter_ns: 0.0,
             changed: 0,
-            changed_ns: [i64::MIN; 8],
+            changed_ns: [i64::MIN; 16],
             heat: Box::new([0; 64]),
             notched: 0,
             hidden: false,
@@ -82,7 +82,10 @@ impl Row {
             while bits != 0 {
                 let bit = bits.leading_zeros() as usize;
                 self.heat[bit] = self.heat[bit].saturating_add(1);
-                self.changed_ns[bit / 8] = time_ns;
+                // What is notched is not worth a glance.
+                if self.notched >> (63 - bit) & 1 == 0 {
+                    self.changed_ns[bit / 4] = time_ns;
+                }
                 bits &= !(1 << (63 - bit));
             }
         }
@@ -99,14 +102,9 @@ impl Row {
         TraceRecord { time_ns: self.last_ns, channel: self.channel, event }
     }
 
-    /// Whether a byte has bits whose changes are shown.
-    pub fn shows_changes(&self, byte: usize) -> bool {
-        let mask = (0xFF << (56 - 8 * byte)) & !self.notched;
-        (0..8).any(|bit| self.heat[byte * 8 + bit] > 0 && mask >> (63 - byte * 8 - bit) & 1 != 0)
-    }
-
     /// Hides changes of all bits that changed so far.
     fn notch(&mut self) {
+        self.changed_ns = [i64::MIN; 16];
         for (bit, count) in self.heat.iter().enumerate() {
             if *count > 0 {
                 self.notched |= 1 << (63 - bit);
@@ -202,14 +200,16 @@ mod tests {
         let row = &table.rows()[0];
         assert_eq!((row.count, row.changed), (3, 0));
         assert_eq!((row.heat[7], row.heat[15]), (1, 1));
-        assert_eq!(row.changed_ns[..3], [10_000_000, 10_000_000, i64::MIN]);
-        assert!(row.shows_changes(0) && row.shows_changes(1) && !row.shows_changes(2));
+        let ns = |ms: i64| if ms < 0 { i64::MIN } else { ms * 1_000_000 };
+        // Digit by digit: 00 11, then 01 10.
+        assert_eq!(row.changed_ns[..5], [-1, 10, -1, 10, -1].map(ns));
         table.notch();
-        assert!(!table.rows()[0].shows_changes(0));
-        take(&mut table, 30, "123#8110");
-        assert!(table.rows()[0].shows_changes(0) && !table.rows()[0].shows_changes(1));
+        assert_eq!(table.rows()[0].changed_ns[1], ns(-1));
+        take(&mut table, 30, "123#8011");
+        assert_eq!(table.rows()[0].changed_ns[..4], [30, -1, -1, -1].map(ns));
         table.unnotch();
-        assert!(table.rows()[0].shows_changes(1));
+        take(&mut table, 40, "123#8110");
+        assert_eq!(table.rows()[0].changed_ns[..4], [30, 40, -1, 40].map(ns));
     }
 
     #[test]

@@ -96,14 +96,12 @@ pub struct Seen {
     pub device: Option<DeviceFigures>,
     /// Records taken.
     pub taken: u64,
+    /// The time, as far as it is known from the last record, in nanoseconds as in [`TraceRecord::time_ns`]. A file that
+    /// begins anew sets it back.
+    pub now_ns: i64,
 }
 
 impl Seen {
-    /// The latest time that is known, in nanoseconds as in [`TraceRecord::time_ns`].
-    pub fn now_ns(&self) -> i64 {
-        self.statistics.last_ns().unwrap_or(0)
-    }
-
     /// Frames lost so far, and whether there may have been more.
     pub fn lost(&self) -> (u64, bool) {
         let channels = self.statistics.channels();
@@ -148,6 +146,7 @@ impl Model {
             loads: Vec::new(),
             device: None,
             taken: 0,
+            now_ns: 0,
         };
         Ok(Self {
             history: History::new(history_bytes),
@@ -174,7 +173,8 @@ impl Model {
         if let (None, Some(first)) = (self.first_ns, records.first()) {
             self.first_ns = Some(first.time_ns);
         }
-        let Seen { table, signals, statistics, loads, taken, .. } = &mut self.seen;
+        let Seen { table, signals, statistics, loads, taken, now_ns, .. } = &mut self.seen;
+        *now_ns = records.last().map_or(*now_ns, |last| last.time_ns);
         for record in records {
             statistics.push_with(record, |window| keep_load(loads, window));
             self.history.push(*record);
@@ -186,7 +186,8 @@ impl Model {
 
     /// Time has come to `now_ns` although nothing happened.
     pub fn advance(&mut self, now_ns: i64) {
-        let Seen { statistics, loads, .. } = &mut self.seen;
+        let Seen { statistics, loads, now_ns: latest_ns, .. } = &mut self.seen;
+        *latest_ns = now_ns.max(*latest_ns);
         statistics.advance_with(now_ns, |window| keep_load(loads, window));
     }
 

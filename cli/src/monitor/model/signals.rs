@@ -130,6 +130,10 @@ impl SignalTable {
         row.min = row.min.min(value.value);
         row.max = row.max.max(value.value);
         let (time_ns, last) = (record.time_ns, value.value);
+        // Time that runs backwards, as where a file begins anew, leaves nothing to compare with.
+        if row.samples.back().is_some_and(|sample| time_ns < sample.time_ns) {
+            row.samples.clear();
+        }
         // A sample begins in its own slot of time, so that a fast signal does not stretch one for ever.
         let slot = time_ns.div_euclid(SAMPLE_NS);
         match row.samples.back_mut() {

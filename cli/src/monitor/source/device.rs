@@ -207,7 +207,7 @@ impl Source<'_> {
     /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure
     /// spans it. How many frames are missing nobody knows: at least none.
     fn note_gap(&mut self, channels: &[Channel], now_ns: i64) {
-        let time_ns = lock(self.model).seen.now_ns().max(now_ns);
+        let time_ns = lock(self.model).seen.now_ns.max(now_ns);
         let event = TraceEvent::Lost { stage: Some(LossStage::Link), count: 0, at_least: true };
         let gap = channels.iter().map(|channel| TraceRecord { time_ns, channel: channel.number(), event });
         let gap: Vec<_> = gap.collect();

@@ -124,12 +124,14 @@ fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
     )];
     let data = row.frame.data();
     for (index, byte) in data.iter().enumerate() {
-        let style = if app.heat {
-            heat_style(row, index, app)
-        } else {
-            changed_style(row, index, seen.now_ns(), app)
-        };
-        spans.push(Span::styled(format!("{byte:02X}"), style));
+        for (digit, value) in [(2 * index, byte >> 4), (2 * index + 1, byte & 0xF)] {
+            let style = if app.heat {
+                heat_style(row, digit, app)
+            } else {
+                changed_style(row, digit, seen.now_ns, app)
+            };
+            spans.push(Span::styled(format!("{value:X}"), style));
+        }
         spans.push(Span::raw(" "));
     }
     let room = 3 * (8 - data.len());
@@ -140,16 +142,16 @@ fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
 }
 
 /// Highlighted for a while after a change, unless its bits are notched.
-fn changed_style(row: &Row, byte: usize, now_ns: i64, app: &App) -> Style {
-    if row.changed_ns[byte] == i64::MIN || !row.shows_changes(byte) {
-        return Style::new();
+fn changed_style(row: &Row, digit: usize, now_ns: i64, app: &App) -> Style {
+    match row.changed_ns[digit] {
+        i64::MIN => Style::new(),
+        changed_ns => app.theme.changed(now_ns.saturating_sub(changed_ns).max(0)),
     }
-    app.theme.changed(now_ns.saturating_sub(row.changed_ns[byte]).max(0))
 }
 
-/// The more often the byte's busiest bit changes, the hotter.
-fn heat_style(row: &Row, byte: usize, app: &App) -> Style {
-    let busiest = row.heat[byte * 8..byte * 8 + 8].iter().copied().max().unwrap_or(0);
+/// The more often the digit's busiest bit changes, the hotter.
+fn heat_style(row: &Row, digit: usize, app: &App) -> Style {
+    let busiest = row.heat[digit * 4..digit * 4 + 4].iter().copied().max().unwrap_or(0);
     let share = f64::from(busiest) / row.count.max(1) as f64;
     match share {
         0.0 => app.theme.dim(),

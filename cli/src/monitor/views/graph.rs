@@ -6,7 +6,7 @@ use ratatui::style::Style;
 use ratatui::symbols::Marker;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::canvas::{Canvas, Line as Stroke};
-use ratatui::widgets::{Block, Borders, Paragraph};
+use ratatui::widgets::{Block, Borders, Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::{Sample, Seen, SignalRow};
@@ -31,10 +31,9 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     let chosen: Vec<_> = seen.signals.rows().iter().filter(|row| row.chosen).collect();
     if chosen.is_empty() {
         let text = "No signal is chosen. On the page Signals (3), select one and press Enter.";
-        frame.render_widget(Paragraph::new(text), area);
+        frame.render_widget(Paragraph::new(text).wrap(Wrap { trim: true }), area);
         return;
     }
-    let now_ns = seen.now_ns();
     let digital: Vec<_> = chosen.iter().copied().filter(|row| is_digital(row, seen)).collect();
     let mut panes: Vec<(String, Vec<&SignalRow>)> = Vec::new();
     for row in chosen.iter().copied().filter(|row| !is_digital(row, seen)) {
@@ -48,7 +47,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     heights.extend(digital.iter().map(|_| Constraint::Length(2)));
     heights.push(Constraint::Length(1));
     let areas = Layout::vertical(heights).split(area);
-    let window = Window { now_ns, span_s: app.graph_span, cursor: app.graph_cursor };
+    let window = Window { now_ns: seen.now_ns, span_s: app.graph_span, cursor: app.graph_cursor };
     let mut colour = 0;
     for ((label, rows), area) in panes.iter().zip(areas.iter()) {
         analogue(frame, *area, label, rows, &window, colour, app, seen);

@@ -3,7 +3,7 @@
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::Line;
-use ratatui::widgets::Paragraph;
+use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::Model;
@@ -21,7 +21,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             ),
         ],
         Some(recording) => {
-            let seconds = model.seen.now_ns().saturating_sub(recording.since_ns) as f64 / 1e9;
+            let seconds = model.seen.now_ns.saturating_sub(recording.since_ns) as f64 / 1e9;
             let seconds = if recording.records == 0 { 0.0 } else { seconds.max(0.0) };
             vec![
                 Line::from(format!("Recording to {}", recording.path)).style(app.theme.error()),
@@ -32,5 +32,5 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             ]
         }
     };
-    frame.render_widget(Paragraph::new(lines), area);
+    frame.render_widget(Paragraph::new(lines).wrap(Wrap { trim: true }), area);
 }

@@ -3,7 +3,7 @@
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::text::Line;
-use ratatui::widgets::Paragraph;
+use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::Seen;
@@ -25,7 +25,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     if app.send.is_empty() {
         let database = if seen.signals.has_database() { ", or Message:Signal=value,…" } else { "" };
         let text = format!("The list is empty. a adds a frame, such as 123#DEADBEEF 100ms{database}.");
-        frame.render_widget(Paragraph::new(text), body);
+        frame.render_widget(Paragraph::new(text).wrap(Wrap { trim: true }), body);
         return;
     }
     let heading = Line::from(format!("   C {:<24} {:>10} {:>8}  As typed", "Frame", "Period", "By key"));

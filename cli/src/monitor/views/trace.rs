@@ -93,8 +93,8 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
     };
     let start = format!("{:>17} {} ", seconds(time), record.channel);
     let TraceEvent::Frame { frame, direction, late } = record.event else {
-        let (text, style) = event(&record.event, app);
-        return Line::styled(format!("{start}{text}"), style);
+        let text = format!("{start}{}", event_text(&record.event));
+        return Line::styled(text, event_style(&record.event, theme));
     };
     let sent = direction == cantap::Direction::Tx;
     let mut text = format!(
@@ -112,8 +112,7 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
     }
     match before.map(|before| before.event) {
         Some(TraceEvent::Lost { count, at_least, .. }) => {
-            let least = if at_least { "at least " } else { "" };
-            let _ = write!(text, " {least}{count} lost before");
+            let _ = write!(text, " {} lost before", lost(count, at_least));
             Line::styled(text, theme.loss())
         }
         _ => Line::from(Span::styled(text, if sent { theme.sent() } else { Style::new() })),
@@ -136,28 +135,40 @@ pub fn printable(data: &[u8]) -> String {
 }
 
 /// What a record says that is no frame.
-fn event(event: &TraceEvent, app: &App) -> (String, Style) {
-    let theme = app.theme;
+fn event_text(event: &TraceEvent) -> String {
     let counters = |counters: Option<(u8, u8)>| {
         counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
     };
     match *event {
-        TraceEvent::Frame { .. } => (String::new(), Style::new()),
+        TraceEvent::Frame { .. } => String::new(),
         TraceEvent::BusError { kind, counters: at } => {
-            (format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at)), theme.error())
+            format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at))
         }
-        TraceEvent::ErrorsSuppressed { count } => (format!("E {count} more bus errors"), theme.error()),
-        TraceEvent::State { state, counters: at } => {
-            let style = if state == ErrorState::Active { theme.label() } else { theme.error() };
-            (format!("S {}{}", state_name(state), counters(at)), style)
-        }
+        TraceEvent::ErrorsSuppressed { count } => format!("E {count} more bus errors"),
+        TraceEvent::State { state, counters: at } => format!("S {}{}", state_name(state), counters(at)),
         TraceEvent::Lost { stage, count, at_least } => {
-            let least = if at_least { "at least " } else { "" };
-            (format!("L {least}{count} frames lost {}", stage.map_or("somewhere", stage_name)), theme.loss())
+            format!("L {} frames lost {}", lost(count, at_least), stage.map_or("somewhere", stage_name))
         }
-        TraceEvent::TransmitFailed { tag, reason } => {
-            (format!("F frame {tag} not sent: {reason:?}"), theme.error())
-        }
+        TraceEvent::TransmitFailed { tag, reason } => format!("F frame {tag} not sent: {reason:?}"),
+    }
+}
+
+/// How that is drawn.
+fn event_style(event: &TraceEvent, theme: Theme) -> Style {
+    match event {
+        TraceEvent::Lost { .. } => theme.loss(),
+        TraceEvent::State { state: ErrorState::Active, .. } => theme.label(),
+        _ => theme.error(),
+    }
+}
+
+/// How many frames are missing.
+fn lost(count: u32, at_least: bool) -> String {
+    match (count, at_least) {
+        // As while a device was gone.
+        (0, true) => "an unknown number of".to_owned(),
+        (count, true) => format!("at least {count}"),
+        (count, false) => count.to_string(),
     }
 }
 
@@ -199,20 +210,32 @@ pub fn candump_line(model: &Model, number: u64) -> Option<String> {
     Some(format!("({}) can{} {frame}", seconds(record.time_ns), record.channel.saturating_sub(1)))
 }
 
-/// The next record whose frame or name contains `text` (in capitals), from `cursor` on.
+/// Place of the next listed record whose frame, name or event contains `text` (in capitals), from `cursor` on.
 pub fn find(model: &Model, cursor: Option<u64>, text: &str, direction: Direction) -> Option<u64> {
     let (first, end) = (model.history.first(), model.history.end());
     let compact: String = text.chars().filter(|character| !character.is_whitespace()).collect();
-    let matches = |number: &u64| {
-        let Some(record) = model.history.get(*number) else {
-            return false;
-        };
-        record.frame().is_some_and(|frame| frame.to_string().contains(&compact))
-            || model.seen.signals.name_of(record).is_some_and(|name| name.to_uppercase().contains(text))
+    // One for all of millions of records.
+    let mut line = String::new();
+    let mut contains = |what: &dyn std::fmt::Display, wanted: &str| {
+        line.clear();
+        // Writing to a String cannot fail.
+        let _ = write!(line, "{what}");
+        line.make_ascii_uppercase();
+        line.contains(wanted)
+    };
+    let mut matches = |place: &u64| match model.history.get(*place) {
+        None => false,
+        Some(record) => match record.frame() {
+            Some(frame) => {
+                contains(frame, &compact)
+                    || model.seen.signals.name_of(record).is_some_and(|name| contains(&name, text))
+            }
+            None => contains(&event_text(&record.event), text),
+        },
     };
     let from = cursor.unwrap_or(end);
     match direction {
-        Direction::Back => (first..from.min(end)).rev().find(matches),
-        Direction::Forward => (from.saturating_add(1).max(first)..end).find(matches),
+        Direction::Back => (first..from.min(end)).rev().find(&mut matches),
+        Direction::Forward => (from.saturating_add(1).max(first)..end).find(&mut matches),
     }
 }

@@ -3,22 +3,31 @@
 //! The screens are files in `snapshots/`. After a change that is meant, write them anew with
 //! `CANTAP_OVERWRITE=1 cargo test -p cantap-cli monitor` and look at the difference.
 
+mod colours;
+mod keys;
+mod random;
+
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Receiver;
 
+use cantap::device::ClockReport;
 use cantap::formats::{ReadOptions, open_reader};
 use cantap::signals::{Decoder, Source};
 use cantap::stats::Options;
-use cantap::wire::message::Mode;
-use cantap::wire::record::{BusErrorKind, LossStage};
-use cantap::{Address, Channel, TraceEvent, TraceRecord};
+use cantap::wire::BitTiming;
+use cantap::wire::message::{ChannelConfig, ChannelStatus, Status};
+use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap::{Address, Direction, TraceEvent, TraceRecord};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
-use super::app::{App, Flow, TimeMode, View};
-use super::model::{Model, Recording, SourceState};
+use super::app::{App, Flow, View};
+use super::model::{DeviceFigures, Model, Recording, SourceState};
 use super::source::{Order, Plan};
 use super::theme::Theme;
 use super::{orders, screen_text};
+
+/// A small screen and a wide one.
+const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];
 
 fn here() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/monitor/snapshots")
@@ -54,12 +63,58 @@ fn model() -> Model {
     model
 }
 
+/// What a board says about itself in the middle of work.
+fn device() -> DeviceFigures {
+    let mut figures = DeviceFigures {
+        queue_bytes: 98_304,
+        name: "olimex-p405 3A0042001951".to_owned(),
+        reconnects: 1,
+        clock: Some(ClockReport { drift_ppm: Some(-12.34), round_trip_ns: 412_000 }),
+        ..DeviceFigures::default()
+    };
+    let closed = ChannelStatus {
+        open: None,
+        state: ErrorState::Active,
+        tec: 0,
+        rec: 0,
+        last_error: None,
+        frames: 5999,
+        lost_controller: 0,
+        lost_queue: 17,
+        bus_errors: 1,
+        transmitted: 3,
+        transmit_failures: 1,
+        tx_pending: 2,
+    };
+    let timing = BitTiming::choose(36_000_000, 250_000, None).unwrap();
+    let listening = ChannelConfig::listen_only(timing);
+    figures.status = Some(Status {
+        ticks: 0,
+        queue_bytes: 4_915,
+        queue_high_water_bytes: 49_152,
+        bad_requests: 0,
+        temperature_decicelsius: None,
+        supply_millivolts: None,
+        channels: [
+            ChannelStatus { open: Some(listening), state: ErrorState::Warning, rec: 97, ..closed },
+            closed,
+        ],
+    });
+    figures.counters.channels[0].received = 5999;
+    figures.counters.bytes = 91_784;
+    figures
+}
+
 fn app(view: View) -> (App, Receiver<Order>) {
     let (sender, receiver) = orders();
     let theme = Theme { colour: true, light: false, unicode: true };
     let options = Options { channel_bitrate_bps: vec![(1, 250_000)], ..Options::default() };
     let plan = Plan::listening(Address::Virtual(String::new()), &options);
     (App::new(view, theme, Some(plan), sender), receiver)
+}
+
+fn frame(text: &str) -> TraceEvent {
+    TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false }
 }
 
 fn press(app: &mut App, model: &mut Model, keys: &str) {
@@ -86,6 +141,9 @@ fn check_page(view: View) {
         press(&mut app, &mut model, "a123#DEADBEEF 100ms\na2:CogSogRapid:Speed=1.5,Course=2\n");
         assert_eq!(app.send.len(), 2, "{}", app.message);
     }
+    if view == View::Statistics {
+        model.seen.device = Some(device());
+    }
     if view == View::Record {
         model.recording = Some(Recording {
             path: "boat.blf".to_owned(),
@@ -94,7 +152,7 @@ fn check_page(view: View) {
             since_ns: model.first_ns.unwrap(),
         });
     }
-    for size in [(80, 24), (160, 50)] {
+    for size in SIZES {
         let name = format!("{}-{}x{}", view.title().to_lowercase(), size.0, size.1);
         check(&name, &screen_text(&mut app, &model, size).unwrap());
     }
@@ -140,12 +198,34 @@ fn the_help_lies_over_the_page() {
     let mut model = model();
     let (mut app, _orders) = app(View::Fixed);
     press(&mut app, &mut model, "h");
-    check("help-80x24", &screen_text(&mut app, &model, (80, 24)).unwrap());
+    for (width, height) in SIZES {
+        let text = screen_text(&mut app, &model, (width, height)).unwrap();
+        check(&format!("help-{width}x{height}"), &text);
+    }
     press(&mut app, &mut model, "h");
     assert!(!app.help);
 }
 
-/// Every key has a line in the help, and the help fits the smallest usual screen.
+/// What is asked for, what is typed and what is wrong with it are in sight on the smallest usual screen.
+#[test]
+fn a_line_of_input_is_in_sight_whatever_is_asked() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Record);
+    press(
+        &mut app,
+        &mut model,
+        "r/home/somebody/measurements/2026-11-21/a-long-way-from-here-to-there.blf if ",
+    );
+    press(&mut app, &mut model, "Speed > 80");
+    check("prompt-80x24", &screen_text(&mut app, &model, (80, 24)).unwrap());
+    model.notice =
+        "profile /home/somebody/measurements/car.toml, line 3: unknown field `speed`, expected one of \
+                    `device`, `bitrates`, `normal`, `databases`"
+            .to_owned();
+    app.prompt = None;
+    check("notice-80x24", &screen_text(&mut app, &model, (80, 24)).unwrap());
+}
+
 #[test]
 fn no_page_needs_more_than_ascii_where_the_terminal_has_no_more() {
     let model = model();
@@ -171,119 +251,4 @@ fn no_size_makes_any_page_panic() {
             press(&mut app, &mut model, "h");
         }
     }
-}
-
-#[test]
-fn pausing_stops_the_display_but_not_the_model() {
-    let mut model = model();
-    for view in [View::Trace, View::Fixed] {
-        let (mut app, _orders) = app(view);
-        press(&mut app, &mut model, " ");
-        let rows = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
-        let before = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
-        let last = *model.history.get(model.history.end() - 1).unwrap();
-        let taken = model.seen.taken;
-        model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000, ..last }; 3]);
-        assert_eq!(model.seen.taken, taken + 3);
-        let after = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
-        if view == View::Fixed {
-            assert_eq!(before, after);
-        } else {
-            // There is more below now, but what was there stays.
-            let shown: Vec<_> = before.iter().filter(|line| line.contains("19FA0402")).collect();
-            assert!(!shown.is_empty() && shown.iter().all(|line| after.contains(line)));
-        }
-        press(&mut app, &mut model, " ");
-        assert_ne!(rows(screen_text(&mut app, &model, (110, 30)).unwrap()), before);
-    }
-}
-
-#[test]
-fn a_search_finds_older_and_newer_frames_by_bytes_and_by_name() {
-    let mut model = model();
-    let (mut app, _orders) = app(View::Trace);
-    press(&mut app, &mut model, "/09f802\n");
-    let found = app.cursor.unwrap();
-    press(&mut app, &mut model, "n");
-    let older = app.cursor.unwrap();
-    assert!(older < found);
-    press(&mut app, &mut model, "N");
-    assert_eq!(app.cursor, Some(found));
-    press(&mut app, &mut model, "/positionrapid\n");
-    let record = model.history.get(app.cursor.unwrap()).unwrap();
-    assert_eq!(record.frame().unwrap().id().to_string(), "09F80102");
-    press(&mut app, &mut model, "/7FF#1234\n");
-    assert_eq!(app.message, "'7FF#1234' is not there");
-    press(&mut app, &mut model, "y");
-    assert!(app.clipboard.unwrap().contains("can0 09F80102#"));
-}
-
-#[test]
-fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
-    let mut model = model();
-    let (mut app, orders) = app(View::Send);
-    press(&mut app, &mut model, "a123#11 100ms\n\n ");
-    assert_eq!(app.message, "listen-only: nothing is sent; press m to take part in the bus");
-    assert!(orders.try_recv().is_err());
-    press(&mut app, &mut model, "m");
-    assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode() == Mode::Normal));
-    press(&mut app, &mut model, "\n");
-    assert!(matches!(orders.try_recv().unwrap(), Order::Send(Channel::Can1, _)));
-    press(&mut app, &mut model, " ");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, Some(_))));
-    press(&mut app, &mut model, "d");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, None)));
-    assert!(app.send.is_empty());
-}
-
-#[test]
-fn what_is_typed_wrong_is_explained_and_stays_to_be_mended() {
-    let mut model = model();
-    let (mut app, _orders) = app(View::Send);
-    press(&mut app, &mut model, "a123#1\n");
-    assert!(app.message.contains("pairs of hexadecimal digits"), "{}", app.message);
-    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "123#1");
-    press(&mut app, &mut model, "1\n");
-    assert_eq!((app.prompt.is_none(), app.send.len()), (true, 1));
-    press(&mut app, &mut model, "b");
-    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "1:250000");
-}
-
-#[test]
-fn clearing_forgets_what_was_seen_only() {
-    let mut model = model();
-    let (mut app, _orders) = app(View::Fixed);
-    press(&mut app, &mut model, "tc");
-    assert_eq!(
-        (model.seen.table.rows().len(), model.seen.taken, model.seen.statistics.channels().len()),
-        (0, 0, 0)
-    );
-    assert_eq!(app.time_mode, TimeMode::Delta);
-    screen_text(&mut app, &model, (80, 24)).unwrap();
-}
-
-#[test]
-fn rows_can_be_hidden_and_shown_and_sorted() {
-    let mut model = model();
-    let (mut app, _orders) = app(View::Fixed);
-    screen_text(&mut app, &model, (80, 24)).unwrap();
-    let all = app.fixed_order.len();
-    press(&mut app, &mut model, "x");
-    screen_text(&mut app, &model, (80, 24)).unwrap();
-    assert_eq!(app.fixed_order.len(), all - 1);
-    press(&mut app, &mut model, "us");
-    screen_text(&mut app, &model, (80, 24)).unwrap();
-    assert_eq!((app.fixed_order.len(), app.fixed_order[0].1.to_string().as_str()), (all, "19FA0402"));
-    press(&mut app, &mut model, "S");
-    screen_text(&mut app, &model, (80, 24)).unwrap();
-    assert_eq!(app.fixed_order.last().unwrap().1.to_string(), "19FA0402");
-}
-
-#[test]
-fn q_leaves_and_so_does_ctrl_c() {
-    let mut model = model();
-    let (mut app, _orders) = app(View::Trace);
-    let key = |code, modifiers| KeyEvent::new(code, modifiers);
-    assert_eq!(app.key(key(KeyCode::Char('q'), KeyModifiers::NONE), &mut model), Flow::Quit);
-    assert_eq!(app.key(key(KeyCode::Char('c'), KeyModifiers::CONTROL), &mut model), Flow::Quit);
 }

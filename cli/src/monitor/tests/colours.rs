@@ -1,0 +1,104 @@
+//! What is coloured, and how it is told apart without colours.
+
+use std::sync::Arc;
+
+use cantap::signals::{Decoder, Source};
+use cantap::stats::Options;
+use cantap::{TraceEvent, TraceRecord};
+use ratatui::Terminal;
+use ratatui::backend::TestBackend;
+use ratatui::buffer::Buffer;
+use ratatui::style::{Color, Modifier};
+
+use super::super::app::{App, View};
+use super::super::model::Model;
+use super::super::views;
+use super::{app, frame, model, press};
+
+fn buffer(app: &mut App, model: &Model) -> Buffer {
+    let mut terminal = Terminal::new(TestBackend::new(160, 50)).unwrap();
+    terminal.draw(|frame| views::draw(frame, app, model)).unwrap();
+    terminal.backend().buffer().clone()
+}
+
+/// The colour and the modifiers of a text's first character.
+fn style_of(buffer: &Buffer, text: &str) -> (Color, Modifier) {
+    for row in 0..buffer.area.height {
+        let line: String = (0..buffer.area.width).map(|column| buffer[(column, row)].symbol()).collect();
+        if let Some(at) = line.find(text) {
+            let column = line[..at].chars().count() as u16;
+            let cell = &buffer[(column, row)];
+            return (cell.fg, cell.modifier);
+        }
+    }
+    panic!("there is no {text:?}");
+}
+
+#[test]
+fn errors_are_red_and_what_follows_a_loss_is_yellow_with_the_number() {
+    let model = model();
+    let (mut app, _orders) = app(View::Trace);
+    let dark = buffer(&mut app, &model);
+    assert_eq!(style_of(&dark, "E bus error: CRC").0, Color::LightRed);
+    assert_eq!(style_of(&dark, "L 17 frames lost in the device's queue").0, Color::Yellow);
+    assert_eq!(style_of(&dark, "17 lost before").0, Color::Yellow);
+    app.theme.light = true;
+    assert_eq!(style_of(&buffer(&mut app, &model), "E bus error: CRC").0, Color::Red);
+    app.theme.colour = false;
+    let plain = buffer(&mut app, &model);
+    assert_eq!(style_of(&plain, "E bus error: CRC"), (Color::Reset, Modifier::BOLD));
+    assert_eq!(style_of(&plain, "17 lost before"), (Color::Reset, Modifier::REVERSED));
+    let coloured = plain.content.iter().filter(|cell| (cell.fg, cell.bg) != (Color::Reset, Color::Reset));
+    assert_eq!(coloured.count(), 0);
+}
+
+#[test]
+fn digits_that_changed_are_marked_fade_and_can_be_notched() {
+    let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 0).unwrap();
+    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    model.take(&[at(0, "123#1020"), at(10, "123#1320")]);
+    let (mut app, _orders) = app(View::Fixed);
+    // The low half of the first byte only.
+    let fresh = buffer(&mut app, &model);
+    assert_eq!((style_of(&fresh, "13 20").0, style_of(&fresh, "20 ").0), (Color::Reset, Color::Reset));
+    assert_eq!(style_of(&fresh, "3 20").0, Color::LightYellow);
+    model.take(&[at(700, "124#")]);
+    assert_eq!(style_of(&buffer(&mut app, &model), "3 20").0, Color::Yellow);
+    model.take(&[at(9000, "124#")]);
+    assert_eq!(style_of(&buffer(&mut app, &model), "3 20").0, Color::Reset);
+    // What changes anyway is hidden, another bit of the same digit is not.
+    press(&mut app, &mut model, "#");
+    model.take(&[at(9001, "123#1020")]);
+    assert_eq!(style_of(&buffer(&mut app, &model), "0 20").0, Color::Reset);
+    model.take(&[at(9002, "123#1820")]);
+    assert_eq!(style_of(&buffer(&mut app, &model), "8 20").0, Color::LightYellow);
+}
+
+#[test]
+fn alarms_are_red_above_and_blue_below_each_with_its_arrow() {
+    let text = r#"
+        version = 1
+        [[message]]
+        name = "M"
+        id = 0x123
+        length = 1
+        [[message.signal]]
+        name = "Level"
+        at = "D1"
+        alarm = { min = 10, max = 200 }
+    "#;
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("m.toml");
+    std::fs::write(&path, text).unwrap();
+    let database = cantap::signals::load(&path).unwrap();
+    assert_eq!(database.warnings, []);
+    let decoder = Arc::new(Decoder::new(vec![Source { channel: None, database }]));
+    for (data, arrow, colour) in [("FF", "▲", Color::LightRed), ("01", "▼", Color::LightBlue)] {
+        let mut model = Model::new(Arc::clone(&decoder), Options::default(), 0).unwrap();
+        let event: TraceEvent = frame(&format!("123#{data}"));
+        model.take(&[TraceRecord { time_ns: 0, channel: 1, event }]);
+        let (mut app, _orders) = app(View::Signals);
+        press(&mut app, &mut model, "j");
+        assert_eq!(style_of(&buffer(&mut app, &model), arrow).0, colour);
+    }
+}

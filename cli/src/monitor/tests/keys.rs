@@ -1,0 +1,247 @@
+//! What keys do.
+
+use cantap::wire::message::Mode;
+use cantap::{Channel, TraceRecord};
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
+
+use super::super::app::{Flow, TimeMode, View};
+use super::super::screen_text;
+use super::super::source::Order;
+use super::{app, model, press};
+
+#[test]
+fn pausing_stops_the_display_but_not_the_model() {
+    let mut model = model();
+    for view in [View::Trace, View::Fixed] {
+        let (mut app, _orders) = app(view);
+        press(&mut app, &mut model, " ");
+        let rows = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
+        let before = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
+        let last = *model.history.get(model.history.end() - 1).unwrap();
+        let taken = model.seen.taken;
+        model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000, ..last }; 3]);
+        assert_eq!(model.seen.taken, taken + 3);
+        let after = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
+        if view == View::Fixed {
+            assert_eq!(before, after);
+        } else {
+            // There is more below now, but what was there stays.
+            let shown: Vec<_> = before.iter().filter(|line| line.contains("19FA0402")).collect();
+            assert!(!shown.is_empty() && shown.iter().all(|line| after.contains(line)));
+        }
+        press(&mut app, &mut model, " ");
+        assert_ne!(rows(screen_text(&mut app, &model, (110, 30)).unwrap()), before);
+    }
+}
+
+#[test]
+fn a_search_finds_older_and_newer_frames_by_bytes_and_by_name() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Trace);
+    press(&mut app, &mut model, "/09f802\n");
+    let found = app.cursor.unwrap();
+    press(&mut app, &mut model, "n");
+    let older = app.cursor.unwrap();
+    assert!(older < found);
+    press(&mut app, &mut model, "N");
+    assert_eq!(app.cursor, Some(found));
+    press(&mut app, &mut model, "/positionrapid\n");
+    let record = model.history.get(app.cursor.unwrap()).unwrap();
+    assert_eq!(record.frame().unwrap().id().to_string(), "09F80102");
+    press(&mut app, &mut model, "/7FF#1234\n");
+    assert_eq!(app.message, "'7FF#1234' is not there");
+    press(&mut app, &mut model, "y");
+    assert!(app.clipboard.unwrap().contains("can0 09F80102#"));
+}
+
+#[test]
+fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Send);
+    press(&mut app, &mut model, "a123#11 100ms\n\n ");
+    assert_eq!(app.message, "listen-only: nothing is sent; press m to take part in the bus");
+    assert!(orders.try_recv().is_err());
+    press(&mut app, &mut model, "m");
+    assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode() == Mode::Normal));
+    press(&mut app, &mut model, "\n");
+    assert!(matches!(orders.try_recv().unwrap(), Order::Send(Channel::Can1, _)));
+    press(&mut app, &mut model, " ");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, Some(_))));
+    press(&mut app, &mut model, "d");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, None)));
+    assert!(app.send.is_empty());
+}
+
+#[test]
+fn what_is_typed_wrong_is_explained_and_stays_to_be_mended() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Send);
+    press(&mut app, &mut model, "a123#1\n");
+    assert!(app.message.contains("pairs of hexadecimal digits"), "{}", app.message);
+    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "123#1");
+    press(&mut app, &mut model, "1\n");
+    assert_eq!((app.prompt.is_none(), app.send.len()), (true, 1));
+    press(&mut app, &mut model, "b");
+    assert_eq!(app.prompt.as_ref().unwrap().line.text(), "1:250000");
+}
+
+#[test]
+fn clearing_forgets_what_was_seen_only() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Fixed);
+    press(&mut app, &mut model, "tc");
+    assert_eq!(
+        (model.seen.table.rows().len(), model.seen.taken, model.seen.statistics.channels().len()),
+        (0, 0, 0)
+    );
+    assert_eq!(app.time_mode, TimeMode::Delta);
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+}
+
+#[test]
+fn rows_can_be_hidden_and_shown_and_sorted() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Fixed);
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+    let all = app.fixed_order.len();
+    press(&mut app, &mut model, "x");
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+    assert_eq!(app.fixed_order.len(), all - 1);
+    press(&mut app, &mut model, "us");
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+    assert_eq!((app.fixed_order.len(), app.fixed_order[0].1.to_string().as_str()), (all, "19FA0402"));
+    press(&mut app, &mut model, "S");
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+    assert_eq!(app.fixed_order.last().unwrap().1.to_string(), "19FA0402");
+}
+
+#[test]
+fn q_leaves_and_so_does_ctrl_c() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Trace);
+    let key = |code, modifiers| KeyEvent::new(code, modifiers);
+    assert_eq!(app.key(key(KeyCode::Char('q'), KeyModifiers::NONE), &mut model), Flow::Quit);
+    assert_eq!(app.key(key(KeyCode::Char('c'), KeyModifiers::CONTROL), &mut model), Flow::Quit);
+}
+
+#[test]
+fn a_filter_hides_what_was_seen_before_too_and_gives_it_back() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Trace);
+    let all = model.history.end();
+    let show = |view: View, app: &mut super::App, model: &super::Model| {
+        app.view = view;
+        screen_text(app, model, (110, 40)).unwrap()
+    };
+    press(&mut app, &mut model, "f09F80202:1FFFFFFF\n");
+    for view in [View::Trace, View::Fixed, View::Signals] {
+        let text = show(view, &mut app, &model);
+        assert!(text.contains("FILTER") && text.contains("CogSogRapid"), "{text}");
+        assert!(!text.contains("PositionRapid") && !text.contains("09F80102"), "{text}");
+    }
+    // Losses are told whatever is filtered.
+    assert!(show(View::Trace, &mut app, &model).contains("17 frames lost"));
+    let listed = model.history.end() - model.history.first();
+    assert!((300..1000).contains(&listed), "{listed}");
+    // What comes is filtered alike, and statistics and recording take everything.
+    let last = *model.history.get(model.history.end() - 1).unwrap();
+    let other = TraceRecord { event: super::frame("123#11"), ..last };
+    model.take(&[last, other]);
+    assert_eq!(model.history.end() - model.history.first(), listed + 1);
+    press(&mut app, &mut model, "f");
+    app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
+    press(&mut app, &mut model, "\n");
+    assert_eq!(model.history.end(), all + 2);
+    assert!(show(View::Trace, &mut app, &model).contains("123 D 1 11"));
+    assert!(show(View::Fixed, &mut app, &model).contains("PositionRapid"));
+}
+
+#[test]
+fn the_selected_record_stays_selected_when_the_filter_changes() {
+    let mut model = model();
+    let (mut app, _orders) = app(View::Trace);
+    press(&mut app, &mut model, "/09F80202\n");
+    let selected = *model.history.get(app.cursor.unwrap()).unwrap();
+    press(&mut app, &mut model, "f09F80202:1FFFFFFF\n");
+    assert_eq!(*model.history.get(app.cursor.unwrap()).unwrap(), selected);
+    // Nothing passes: nothing is selected, and no key minds.
+    press(&mut app, &mut model, "f,7FF:7FF\n");
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+    press(&mut app, &mut model, "njky ");
+    app.key(KeyEvent::from(KeyCode::Home), &mut model);
+    screen_text(&mut app, &model, (80, 24)).unwrap();
+}
+
+#[test]
+fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
+    let mut model = model();
+    for view in [View::Signals, View::Graph, View::Statistics] {
+        let (mut app, _orders) = app(view);
+        press(&mut app, &mut model, " ");
+        let page = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
+        let before = page(screen_text(&mut app, &model, (110, 30)).unwrap());
+        let last = *model.history.get(model.history.end() - 1).unwrap();
+        let moved = TraceRecord { event: super::frame("09F80202#01FC6C000001FFFF"), ..last };
+        model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000_000, ..moved }; 30]);
+        let after = page(screen_text(&mut app, &model, (110, 30)).unwrap());
+        // The memory in use is told as it is.
+        let told =
+            |lines: &[String]| lines.iter().filter(|line| !line.starts_with("Memory")).cloned().collect();
+        let (before, after): (Vec<String>, Vec<String>) = (told(&before), told(&after));
+        assert_eq!(before, after, "{view:?}");
+    }
+    let (mut app, _orders) = app(View::Fixed);
+    press(&mut app, &mut model, " ");
+    screen_text(&mut app, &model, (110, 30)).unwrap();
+    let rows = app.fixed_order.len();
+    press(&mut app, &mut model, "x");
+    screen_text(&mut app, &model, (110, 30)).unwrap();
+    assert_eq!(app.fixed_order.len(), rows - 1);
+    press(&mut app, &mut model, " ");
+    screen_text(&mut app, &model, (110, 30)).unwrap();
+    assert_eq!(app.fixed_order.len(), rows - 1);
+}
+
+#[test]
+fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Send);
+    press(&mut app, &mut model, "ma123#11 100ms\n ");
+    assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, Some(_))));
+    // To the other channel: it must end on the first.
+    press(&mut app, &mut model, "e");
+    app.key(KeyEvent::from(KeyCode::Home), &mut model);
+    press(&mut app, &mut model, "2:\n");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, None)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 0, Some(_))));
+    assert_eq!(app.send[0].text, "2:123#11 100ms");
+    // Each has a slot of its own, and keeps it when others go.
+    press(&mut app, &mut model, "a2:124#22 50ms\n");
+    app.key(KeyEvent::from(KeyCode::Down), &mut model);
+    press(&mut app, &mut model, " ");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 1, Some(_))));
+    app.key(KeyEvent::from(KeyCode::Up), &mut model);
+    press(&mut app, &mut model, "d");
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 0, None)));
+    assert_eq!((app.send.len(), app.send[0].slot), (1, Some(1)));
+    // The device has no such slot.
+    model.refused.push((Channel::Can2, 1));
+    app.catch_up(&mut model);
+    assert_eq!(app.send[0].slot, None);
+    assert!(orders.try_recv().is_err());
+}
+
+#[test]
+fn a_letter_with_control_is_not_that_letter() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Trace);
+    for letter in ['q', 'c', 'm', 'r', 'A'] {
+        let control = KeyEvent::new(KeyCode::Char(letter), KeyModifiers::CONTROL);
+        let flow = app.key(control, &mut model);
+        assert_eq!(flow == Flow::Quit, letter == 'c');
+    }
+    assert!(app.prompt.is_none() && orders.try_recv().is_err());
+    let z = KeyEvent::new(KeyCode::Char('z'), KeyModifiers::CONTROL);
+    assert_eq!(app.key(z, &mut model), Flow::Suspend);
+}

@@ -1,0 +1,160 @@
+//! The last line: keys, what was just said, or a line of input. What is too long for it lies over the page.
+
+use ratatui::Frame;
+use ratatui::layout::Rect;
+use ratatui::style::{Modifier, Style};
+use ratatui::text::{Line, Span};
+use ratatui::widgets::{Clear, Paragraph};
+
+use super::super::app::{App, Prompt, PromptKind, View};
+use super::super::model::{Model, SourceState};
+use super::super::theme::Theme;
+
+/// Draws it, and what is too long for it over the end of `body`.
+pub fn draw(frame: &mut Frame<'_>, body: Rect, bottom: Rect, app: &App, model: &Model) {
+    let width = usize::from(bottom.width);
+    let line = if let Some(prompt) = &app.prompt {
+        let hint = if app.message.is_empty() { question(prompt.kind) } else { app.message.as_str() };
+        over(frame, body, hint);
+        input(prompt, width)
+    } else {
+        match said(app, model) {
+            Some(said) if said.chars().count() + 1 > width => {
+                over(frame, body, &said);
+                Line::from(" any key goes on, h helps")
+            }
+            Some(said) => Line::from(format!(" {said}")),
+            None => Line::from(format!(" {}", keys(app, model, width.saturating_sub(1)))),
+        }
+    };
+    frame.render_widget(Paragraph::new(line).style(Theme::bar()), bottom);
+}
+
+/// A text over the page's last lines, as many as it needs.
+fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
+    let lines = wrapped(text, usize::from(body.width).saturating_sub(1));
+    let height = body.height.min(u16::try_from(lines.len()).unwrap_or(u16::MAX));
+    let place = Rect { y: body.y + body.height - height, height, ..body };
+    frame.render_widget(Clear, place);
+    let lines: Vec<_> = lines.into_iter().map(|line| Line::from(format!(" {line}"))).collect();
+    frame.render_widget(Paragraph::new(lines).style(Theme::bar()), place);
+}
+
+/// Lines of at most so many characters; only a word that is longer is cut.
+fn wrapped(text: &str, width: usize) -> Vec<String> {
+    let width = width.max(1);
+    let mut lines = vec![String::new()];
+    let mut room = width;
+    for word in text.split_whitespace() {
+        let mut word: Vec<char> = word.chars().collect();
+        if room < width && word.len() + 1 > room {
+            lines.push(String::new());
+            room = width;
+        }
+        while word.len() > width {
+            let rest = word.split_off(width);
+            lines.push(word.into_iter().collect());
+            word = rest;
+            room = 0;
+        }
+        if room == 0 {
+            lines.push(String::new());
+            room = width;
+        }
+        if let Some(line) = lines.last_mut() {
+            if room < width {
+                line.push(' ');
+                room -= 1;
+            }
+            line.extend(&word);
+            room -= word.len();
+        }
+    }
+    lines.retain(|line| !line.is_empty());
+    lines
+}
+
+/// The line of input, scrolled so that its cursor is in sight.
+fn input(prompt: &Prompt, width: usize) -> Line<'static> {
+    let (before, behind) = prompt.line.halves();
+    let hidden = (before.chars().count() + 4).saturating_sub(width);
+    let before: String = before.chars().skip(hidden).collect();
+    let mut behind = behind.chars();
+    // The cursor is a block, and an underscore where there is nothing.
+    let cursor = behind.next().map_or("_".to_owned(), String::from);
+    Line::from(vec![
+        Span::raw(format!(" > {before}")),
+        Span::styled(cursor, Style::new().add_modifier(Modifier::UNDERLINED | Modifier::BOLD)),
+        Span::raw(behind.collect::<String>()),
+    ])
+}
+
+fn question(kind: PromptKind) -> &'static str {
+    match kind {
+        PromptKind::Search => "search the trace: bytes, identifiers, names, words of errors and losses",
+        PromptKind::Filter => "show only, in candump's syntax, such as 123:7FF or can1 (empty: all)",
+        PromptKind::Record => {
+            "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, each also .gz .zst)"
+        }
+        PromptKind::Send => "[CHANNEL:]FRAME or Message:Signal=value,…, then a period if it is periodic",
+        PromptKind::BitRate => "bit rates: 500k, or one for each channel: 1:500k 2:250k",
+        PromptKind::Device => "device: a serial port, virtual, or emu:FIRMWARE.elf",
+    }
+}
+
+/// What there is to be told.
+fn said(app: &App, model: &Model) -> Option<String> {
+    if !app.message.is_empty() {
+        return Some(app.message.clone());
+    }
+    if !model.notice.is_empty() {
+        return Some(model.notice.clone());
+    }
+    match (&model.source, &model.unread) {
+        (SourceState::Gone(reason), _) => Some(reason.clone()),
+        (_, Some((count, first))) if app.view == View::Statistics => {
+            let places = if *count == 1 { "place" } else { "places" };
+            Some(format!("{count} {places} could not be read and are left out, the first: {first}"))
+        }
+        _ => None,
+    }
+}
+
+/// As many of the page's keys, which stand two blanks apart, as there is room for.
+fn keys(app: &App, model: &Model, width: usize) -> String {
+    let keys = match app.view {
+        View::Trace => "t time  / search  n N next  y copy  ↑↓ scroll  End newest  f filter",
+        View::Fixed => "s S sort  g group  # * notch  H heat  x u hide  o colour  f filter",
+        View::Signals => "↑↓ select  Enter into the graph",
+        View::Graph => "+ - zoom  ← → cursor  Esc no cursor",
+        View::Statistics => "b bit rate  A find it  D device  m mode",
+        View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
+        View::Record => "r start or stop",
+    };
+    let playback = match model.source {
+        SourceState::Playing { .. } => "  , . speed  p stop  > step  l loop",
+        _ => "",
+    };
+    let pause = if app.view == View::Send { "" } else { "  Space pause" };
+    let mut all = format!("h help  q quit  {keys}{playback}{pause}  c clear");
+    if all.chars().count() > width {
+        let ends = all.match_indices("  ").map(|(at, _)| at);
+        let end = ends.filter(|end| all[..*end].chars().count() <= width).last().unwrap_or(0);
+        all.truncate(end);
+    }
+    all
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn long_texts_are_wrapped_between_words_and_long_words_are_cut() {
+        assert_eq!(wrapped("one two three", 7), ["one two", "three"]);
+        assert_eq!(wrapped("a /long/path/name is", 6), ["a", "/long/", "path/n", "ame is"]);
+        assert_eq!(wrapped("", 5), [""; 0]);
+        assert_eq!(wrapped("abc", 0), ["a", "b", "c"]);
+        assert_eq!(wrapped("abcdef gh", 3), ["abc", "def", "gh"]);
+    }
+}

@@ -1,0 +1,202 @@
+//! A device that is unplugged and plugged in again while the live view runs: a virtual device behind a pseudo
+//! terminal, at the end of a link with a name that stays.
+#![cfg(unix)]
+
+#[expect(dead_code, reason = "other tests use the rest of it")]
+mod terminal;
+
+use std::os::unix::fs::symlink;
+use std::path::{Path, PathBuf};
+
+use cantap::formats::{ReadOptions, open_reader};
+use cantap::virtual_device::{self, open_terminal};
+use cantap::wire::record::LossStage;
+use cantap::{Address, Channel, Device, TraceEvent, TraceRecord};
+use terminal::Terminal;
+
+/// A port that a device can be plugged into.
+struct Port {
+    _folder: tempfile::TempDir,
+    name: PathBuf,
+    device: Option<virtual_device::Terminal>,
+}
+
+impl Port {
+    fn new() -> Self {
+        let folder = tempfile::tempdir().unwrap();
+        let name = folder.path().join("ttyACM0");
+        Self { _folder: folder, name, device: None }
+    }
+
+    fn name(&self) -> &str {
+        self.name.to_str().unwrap()
+    }
+
+    /// Plugs a device in; its options are those of the virtual device.
+    fn plug(&mut self, options: &str) {
+        self.unplug();
+        let device = open_terminal(options.parse().unwrap()).unwrap();
+        symlink(device.path(), &self.name).unwrap();
+        self.device = Some(device);
+    }
+
+    fn unplug(&mut self) {
+        // Ended before its name goes, as a cable does it.
+        self.device = None;
+        let _ = std::fs::remove_file(&self.name);
+    }
+}
+
+fn records(path: &Path) -> Vec<TraceRecord> {
+    open_reader(path, &ReadOptions::default()).unwrap().map(Result::unwrap).collect()
+}
+
+/// A figure that stands behind a word on the screen.
+fn figure(screen: &str, word: &str) -> Option<u64> {
+    screen.split_once(word)?.1.split_whitespace().next()?.parse().ok()
+}
+
+#[test]
+fn an_unplugged_device_is_missed_and_goes_on_when_it_is_back() {
+    let mut port = Port::new();
+    port.plug("load=20,frames=std8,serial=ONE");
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("drive.asc");
+    let line = format!("monitor -d {} -b 500k --view statistics -o {}", port.name(), recording.display());
+    let mut view = Terminal::start(&line, (120, 40));
+    view.wait_until("200 frames", |screen| figure(screen, "Frames").is_some_and(|frames| frames > 200));
+    view.wait_for("Device virtual ONE");
+
+    port.unplug();
+    let gone = view.wait_for("GONE, trying again");
+    assert!(gone.contains("lost 0+"), "{gone}");
+    let before = figure(&gone, "Frames").unwrap();
+    // What was seen stays, and it can be looked at.
+    view.keys("2");
+    view.wait_for("Period ms");
+    view.keys("1");
+    let trace = view.wait_for("an unknown number of frames lost on the way to the host");
+    assert!(trace.contains("ttyACM0"), "{trace}");
+    view.keys("5");
+    std::thread::sleep(std::time::Duration::from_millis(1500));
+    port.plug("load=20,frames=std8,serial=ONE");
+    view.wait_for("is back after");
+    let back = view.wait_until("more frames", |screen| {
+        figure(screen, "Frames").is_some_and(|frames| frames > before + 500)
+    });
+    // The load is that of the time in which the device was there.
+    let mean = back.split_once("mean ").unwrap().1.split_once(" %").unwrap().0.parse::<f64>().unwrap();
+    assert!((mean - 20.0).abs() < 1.0, "{back}");
+    assert!(back.contains("1 reconnects"), "{back}");
+
+    // Another board in its place is told.
+    port.unplug();
+    view.wait_for("GONE, trying again");
+    port.plug("load=20,frames=std8,serial=TWO");
+    view.wait_for("another board is at");
+    view.wait_for("Device virtual TWO");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    view.check_given_back();
+    assert!(view.text().contains("records are in"), "{}", view.text());
+
+    // The recording has everything, and both gaps on both channels, in place.
+    let records = records(&recording);
+    let is_gap = |record: &TraceRecord| matches!(record.event, TraceEvent::Lost { .. });
+    let gaps: Vec<_> = records.iter().filter(|record| is_gap(record)).collect();
+    assert_eq!(gaps.iter().map(|gap| gap.channel).collect::<Vec<_>>(), [1, 2, 1, 2]);
+    for gap in gaps {
+        let event = TraceEvent::Lost { stage: Some(LossStage::Link), count: 0, at_least: true };
+        assert_eq!(gap.event, event);
+    }
+    assert!(records.windows(2).all(|pair| pair[0].time_ns <= pair[1].time_ns));
+    let first = records.iter().position(is_gap).unwrap();
+    let next = records[first..].iter().find(|record| record.frame().is_some()).unwrap();
+    assert!(next.time_ns - records[first].time_ns > 1_000_000_000);
+    assert!(records.iter().filter(|record| record.frame().is_some()).count() as u64 > 2 * before);
+}
+
+#[test]
+fn what_was_sent_periodically_is_off_when_the_device_is_back() {
+    let mut port = Port::new();
+    port.plug("load=0");
+    let line = format!("monitor -d {} -b 500k --normal --view send", port.name());
+    let mut view = Terminal::start(&line, (120, 24));
+    // As if pasted.
+    view.wait_for("running");
+    view.keys("a123#11 50ms\n");
+    view.wait_for("123#11 50ms");
+    view.keys(" ");
+    view.wait_for("on 1 123#11");
+    view.keys("2");
+    view.wait_until("a sent frame", |screen| screen.contains("      123   "));
+    port.unplug();
+    view.wait_for("GONE, trying again");
+    // Nothing can be sent meanwhile, and it is said.
+    view.keys("6\r");
+    view.wait_for("there is no device to send with");
+    port.plug("load=0");
+    view.wait_for("nothing is sent periodically any more");
+    view.keys("h");
+    view.wait_for("any key closes");
+    view.keys("h");
+    view.wait_until("off", |screen| screen.contains("   1 123#11") && !screen.contains("on 1 123#11"));
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_device_in_use_elsewhere_and_one_that_comes_late_are_waited_for() {
+    let mut port = Port::new();
+    let line = format!("monitor -d {} -b 500k --view statistics", port.name());
+    let mut view = Terminal::start(&line, (120, 24));
+    view.wait_for("there is no device at");
+    port.plug("load=20");
+    view.wait_for("running");
+    port.unplug();
+    view.wait_for("GONE, trying again");
+    // Somebody else is quicker. The view may have it in the meantime, so that it takes more than one try.
+    let address: Address = port.name().parse().unwrap();
+    let elsewhere = loop {
+        port.plug("load=20");
+        if let Ok(device) = Device::open(&address) {
+            break device;
+        }
+        port.unplug();
+        view.wait_for("GONE, trying again");
+    };
+    view.wait_for("is in use by another program");
+    elsewhere.listen(Channel::Can1, 500_000).unwrap();
+    drop(elsewhere);
+    view.wait_for("running");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_device_that_vanishes_while_its_bit_rate_is_looked_for_comes_back_too() {
+    let mut port = Port::new();
+    // Nothing to be heard, so that the search takes its time.
+    port.plug("load=0,bitrate=250k");
+    let line = format!("monitor -d {} -b 500k --view statistics", port.name());
+    let mut view = Terminal::start(&line, (120, 24));
+    view.wait_for("running");
+    view.keys("A");
+    view.wait_for("A stops");
+    port.unplug();
+    view.wait_for("GONE, trying again");
+    port.plug("load=50,bitrate=250k");
+    view.wait_for("running");
+    view.keys("A");
+    view.wait_for("channel 1: 250000 bit/s; channel 2: 250000 bit/s");
+    view.wait_for("Channel 1: 250000 bit/s");
+    // It can be stopped, and left.
+    view.keys("A");
+    view.wait_for("A stops");
+    view.keys("A");
+    view.wait_for("running");
+    view.keys("A");
+    view.wait_for("A stops");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}

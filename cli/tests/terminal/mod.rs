@@ -1,0 +1,167 @@
+//! The command in a terminal, as a user has it: keys go in, a screen comes out.
+
+use std::io::{Read, Write};
+use std::path::Path;
+use std::process::Command;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use portable_pty::{Child, CommandBuilder, MasterPty, PtySize, native_pty_system};
+
+/// Nothing that is waited for takes so long, however busy the machine is.
+const PATIENCE: Duration = Duration::from_mins(1);
+
+/// A running `cantap` and its terminal.
+pub struct Terminal {
+    child: Box<dyn Child + Send + Sync>,
+    master: Box<dyn MasterPty + Send>,
+    writer: Box<dyn Write + Send>,
+    parser: Arc<Mutex<vt100::Parser>>,
+    stalled: Arc<AtomicBool>,
+}
+
+fn size((columns, rows): (u16, u16)) -> PtySize {
+    PtySize { rows, cols: columns, pixel_width: 0, pixel_height: 0 }
+}
+
+impl Terminal {
+    /// Starts `cantap ARGUMENTS` in a terminal of so many columns and rows.
+    pub fn start(arguments: &str, columns_rows: (u16, u16)) -> Self {
+        Self::start_with(arguments, columns_rows, &[])
+    }
+
+    /// With changes to the environment: a variable's value, or none.
+    pub fn start_with(
+        arguments: &str,
+        columns_rows: (u16, u16),
+        environment: &[(&str, Option<&str>)],
+    ) -> Self {
+        let pair = native_pty_system().openpty(size(columns_rows)).unwrap();
+        let mut command = CommandBuilder::new(env!("CARGO_BIN_EXE_cantap"));
+        command.args(arguments.split_whitespace());
+        command.cwd(Path::new(env!("CARGO_MANIFEST_DIR")));
+        command.env("TERM", "xterm-256color");
+        command.env("LC_ALL", "C.UTF-8");
+        command.env_remove("NO_COLOR");
+        for (name, value) in environment {
+            match value {
+                Some(value) => command.env(name, value),
+                None => command.env_remove(name),
+            }
+        }
+        let child = pair.slave.spawn_command(command).unwrap();
+        drop(pair.slave);
+        let mut reader = pair.master.try_clone_reader().unwrap();
+        let parser = Arc::new(Mutex::new(vt100::Parser::default()));
+        parser
+            .lock()
+            .unwrap()
+            .set_size(columns_rows.1.try_into().unwrap(), columns_rows.0.try_into().unwrap());
+        let stalled = Arc::new(AtomicBool::new(false));
+        let (screen, waits) = (Arc::clone(&parser), Arc::clone(&stalled));
+        std::thread::spawn(move || {
+            let mut bytes = [0; 4096];
+            loop {
+                while waits.load(Ordering::Relaxed) {
+                    std::thread::sleep(Duration::from_millis(5));
+                }
+                match reader.read(&mut bytes) {
+                    Ok(len) if len > 0 => screen.lock().unwrap().process(&bytes[..len]),
+                    _ => return,
+                }
+            }
+        });
+        let writer = pair.master.take_writer().unwrap();
+        Self { child, master: pair.master, writer, parser, stalled }
+    }
+
+    /// Types.
+    pub fn keys(&mut self, keys: &str) {
+        self.writer.write_all(keys.as_bytes()).unwrap();
+        self.writer.flush().unwrap();
+    }
+
+    /// What stands on the screen.
+    pub fn text(&self) -> String {
+        self.parser.lock().unwrap().screen().contents()
+    }
+
+    /// Looks at the screen as the terminal knows it.
+    pub fn screen<T>(&self, look: impl Fn(&vt100::Screen) -> T) -> T {
+        look(self.parser.lock().unwrap().screen())
+    }
+
+    /// Waits until the screen has this text, and returns all of it.
+    pub fn wait_for(&self, text: &str) -> String {
+        self.wait_until(text, |screen| screen.contains(text))
+    }
+
+    /// Waits until the screen is as it should be.
+    pub fn wait_until(&self, what: &str, is_so: impl Fn(&str) -> bool) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let text = self.text();
+            if is_so(&text) {
+                return text;
+            }
+            assert!(Instant::now() < deadline, "this never came: {what}; the screen:\n{text}");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// Another size.
+    pub fn resize(&self, columns_rows: (u16, u16)) {
+        let (columns, rows) = columns_rows;
+        self.parser.lock().unwrap().set_size(rows.try_into().unwrap(), columns.try_into().unwrap());
+        self.master.resize(size(columns_rows)).unwrap();
+    }
+
+    /// The terminal takes no more output, or takes it again.
+    pub fn stall(&self, stalled: bool) {
+        self.stalled.store(stalled, Ordering::Relaxed);
+    }
+
+    /// Sends a signal, by name.
+    pub fn signal(&self, name: &str) {
+        let process = self.child.process_id().unwrap().to_string();
+        assert!(Command::new("kill").args(["-s", name, &process]).status().unwrap().success());
+    }
+
+    /// Whether the terminal waits for whole lines and shows them, as it does for a shell.
+    pub fn is_as_a_shell_wants_it(&self) -> bool {
+        let local = format!("{:?}", self.master.get_termios().unwrap().local_flags);
+        local.contains("ICANON") && local.contains("ECHO")
+    }
+
+    /// Waits for the end; its exit code.
+    pub fn end(&mut self) -> u32 {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait().unwrap() {
+                // What it wrote last is on its way.
+                std::thread::sleep(Duration::from_millis(100));
+                return status.exit_code();
+            }
+            assert!(Instant::now() < deadline, "it does not end; the screen:\n{}", self.text());
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+
+    /// The screen of before is back: cursor shown, no mouse, lines and echo.
+    pub fn check_given_back(&self) {
+        self.screen(|screen| {
+            assert!(!screen.alternate_screen() && !screen.hide_cursor(), "{}", screen.contents());
+            assert_eq!(screen.mouse_protocol_mode(), vt100::MouseProtocolMode::None);
+        });
+        assert!(self.is_as_a_shell_wants_it());
+    }
+}
+
+impl Drop for Terminal {
+    fn drop(&mut self) {
+        // It may have ended long ago.
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}

@@ -11,6 +11,7 @@ use cantap_firmware::ports::Clock;
 use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::session::Session;
 use cantap_wire::{CHANNELS, Channel};
+use heapless::String;
 
 use super::board::{Ending, Filters, ModelClock, VirtualBoard, VirtualChip, VirtualPort};
 use super::controller::{ControlSide, Controller, TrafficSide};
@@ -56,6 +57,7 @@ pub struct World {
     joined: bool,
     witness: Arc<Witness>,
     flash: Flash,
+    serial: String<24>,
     now_ns: u64,
 }
 
@@ -69,6 +71,8 @@ impl World {
             joined: options.joined,
             witness,
             flash: Flash::new(options.settings.clone()),
+            // Cannot fail: longer ones are refused.
+            serial: String::try_from(options.serial.as_str()).unwrap_or_default(),
             now_ns: 0,
         }
     }
@@ -86,6 +90,7 @@ pub struct Machine<'q> {
     loops: [SimBus; CHANNELS],
     joined: bool,
     witness: Arc<Witness>,
+    serial: String<24>,
     /// What it told of earlier firmwares' controllers.
     heard_before: Heard,
     now_ns: u64,
@@ -96,14 +101,10 @@ pub struct Machine<'q> {
 impl<'q> Machine<'q> {
     /// The firmware starts, with an empty queue and nothing open.
     pub fn power_up(queue: &'q RecordQueue, world: World) -> Self {
-        let World { port, buses, loops, joined, witness, flash, now_ns } = world;
+        let World { port, buses, loops, joined, witness, flash, serial, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
         let (producer, consumer) = queue.split();
-        let identity = Identity {
-            board: "virtual",
-            // Cannot fail: longer ones are refused.
-            serial: heapless::String::try_from(options.serial.as_str()).unwrap_or_default(),
-        };
+        let identity = Identity { board: "virtual", serial: serial.clone() };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {
             board: VirtualBoard {
@@ -122,6 +123,7 @@ impl<'q> Machine<'q> {
             controllers,
             heard_before: witness.heard(),
             witness,
+            serial,
             now_ns,
             next_usb_ns: now_ns,
             next_tick_ns: now_ns + MS_NS,
@@ -130,10 +132,10 @@ impl<'q> Machine<'q> {
 
     /// The firmware is gone; buses, port and flash remain.
     pub fn power_down(self) -> World {
-        let Self { board, port, buses, loops, joined, witness, now_ns, .. } = self;
+        let Self { board, port, buses, loops, joined, witness, serial, now_ns, .. } = self;
         // What it had not read is lost with it.
         while port.from_host.take(&mut [0; 64]) > 0 {}
-        World { port, buses, loops, joined, witness, flash: board.chip.flash, now_ns }
+        World { port, buses, loops, joined, witness, flash: board.chip.flash, serial, now_ns }
     }
 
     pub const fn now_ns(&self) -> u64 {

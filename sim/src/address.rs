@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use cantap_wire::Channel;
+use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
+use crate::CYCLES_PER_SECOND;
 use crate::elf::{ElfError, Image};
-use crate::link::{EmulatedPort, Pace, ServeError};
-use crate::rig::{RigError, timing};
+use crate::link::{EmulatedPort, Manner, Pace, ServeError};
 use crate::run::{DEFAULT_BITRATE_BPS, Load, Options, replay};
 use crate::traffic::{Kind, parse_log};
 
@@ -15,25 +16,30 @@ const DEFAULT_LOAD_PERCENT: f64 = 20.0;
 
 /// An emulated device: `FILE.elf`, or `FILE.elf,load=50,frames=std8,bitrate=500000,seed=7`.
 ///
-/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `bitrate` (bit/s; by default that of whoever
-/// opens the channel), `channels` (`1`, `2` or `both`: those with traffic), `seed`, `pace` (`client`: time stands still
-/// while the client does not read; `real`: it goes on), and at the end `log=FILE` (a candump log, replayed at its own
-/// times from the moment a channel is opened; its first interface is channel 1).
+/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst,
+/// and its period), `bitrate` (bit/s; by default that of whoever opens the channel), `channels` (`1`, `2` or `both`:
+/// those with traffic), `ack` (`yes`, `no`: whether the simulated nodes acknowledge),
+/// `errors` (per cent of the frames destroyed), `seed`, `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`:
+/// time stands still while the client does not read; `real`: it goes on), `speed` (how fast time passes at most; 1 is
+/// real time), and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is
+/// opened; its first interface is channel 1).
 #[derive(Clone, Debug)]
 pub struct Address {
     /// The firmware.
     pub file: PathBuf,
     /// The buses and their traffic.
     pub options: Options,
-    /// How time passes.
-    pub pace: Pace,
+    /// How time passes, and whether there is one bus or two.
+    pub manner: Manner,
 }
 
 /// Why an emulated device cannot be had.
 #[derive(Debug, thiserror::Error)]
 pub enum AddressError {
     /// There is no such option.
-    #[error("there is no option '{0}'; there are load, frames, bitrate, channels, seed, pace, log")]
+    #[error(
+        "there is no option '{0}'; there are load, frames, burst, bitrate, channels, ack, errors, seed, wire, pace, speed, log"
+    )]
     Unknown(String),
     /// The value does not fit.
     #[error("'{value}' does not fit the option '{key}': {reason}")]
@@ -69,7 +75,7 @@ impl std::str::FromStr for Address {
         }
         let load = Load::Frames { kind: Kind::Mix, percent: DEFAULT_LOAD_PERCENT };
         let options = Options { load, ..Options::default() };
-        let mut address = Self { file: file.into(), options, pace: Pace::Client };
+        let mut address = Self { file: file.into(), options, manner: Manner::default() };
         for (key, value) in given.into_iter().rev() {
             address.set(key, value)?;
         }
@@ -92,21 +98,35 @@ impl Address {
             value: value.to_owned(),
             reason: reason.to_owned(),
         };
-        let (kind, percent) = match &mut self.options.load {
-            Load::Frames { kind, percent } => (kind, percent),
-            Load::Replay(_) => return Err(AddressError::Unknown(key.to_owned())),
+        let percent = || {
+            let number = value.trim_end_matches('%').parse().ok();
+            let number = number.filter(|number| (0.0..=100.0).contains(number));
+            number.ok_or_else(|| bad("give per cent, 0 to 100"))
         };
         match key {
             "load" => {
-                let number = value.trim_end_matches('%').parse().ok();
-                let number = number.filter(|number| (0.0..=100.0).contains(number));
-                *percent = number.ok_or_else(|| bad("give per cent, 0 to 100"))?;
+                self.options.load = Load::Frames { kind: self.kind(), percent: percent()? };
             }
-            "frames" => *kind = value.parse().map_err(|reason: String| bad(&reason))?,
+            "frames" => {
+                let new = value.parse().map_err(|reason: String| bad(&reason))?;
+                match &mut self.options.load {
+                    Load::Frames { kind, .. } | Load::Bursts { kind, .. } => *kind = new,
+                    Load::Replay(_) => {}
+                }
+            }
+            "burst" => {
+                let burst = value.split_once('/').and_then(|(frames, period)| {
+                    Some((number(frames).filter(|frames| *frames > 0)?, cycles(period)?))
+                });
+                let (frames, period) =
+                    burst.ok_or_else(|| bad("give frames and period, such as 10/960us"))?;
+                self.options.load = Load::Bursts { kind: self.kind(), frames, period };
+            }
             "bitrate" => {
-                let bps = value.parse().map_err(|_| bad("give a rate in bit/s, such as 500000"))?;
-                timing(bps).map_err(|error: RigError| bad(&error.to_string()))?;
-                self.options.bitrate_bps = Some(bps);
+                // The other nodes' clocks need not reach the same rates as the board's.
+                let bps = number(value).filter(|bps| (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(bps));
+                self.options.bitrate_bps =
+                    Some(bps.ok_or_else(|| bad("give 5k to 1M, in bit/s, such as 500000"))?);
             }
             "channels" => {
                 self.options.channels = match value {
@@ -118,10 +138,29 @@ impl Address {
             }
             "seed" => self.options.seed = value.parse().map_err(|_| bad("give a whole number"))?,
             "pace" => {
-                self.pace = match value {
+                self.manner.pace = match value {
                     "client" => Pace::Client,
                     "real" => Pace::RealTime,
                     _ => return Err(bad("give client or real")),
+                }
+            }
+            "speed" => {
+                let speed = value.parse().ok().filter(|speed| (0.001..=1000.0).contains(speed));
+                self.manner.speed = speed.ok_or_else(|| bad("give 0.001 to 1000; 1 is real time"))?;
+            }
+            "wire" => {
+                self.manner.joined = match value {
+                    "apart" => false,
+                    "joined" => true,
+                    _ => return Err(bad("give apart or joined")),
+                }
+            }
+            "errors" => self.manner.error_percent = percent()?,
+            "ack" => {
+                self.manner.acknowledge = match value {
+                    "yes" => true,
+                    "no" => false,
+                    _ => return Err(bad("give yes or no")),
                 }
             }
             _ => return Err(AddressError::Unknown(key.to_owned())),
@@ -129,11 +168,42 @@ impl Address {
         Ok(())
     }
 
+    fn kind(&self) -> Kind {
+        match self.options.load {
+            Load::Frames { kind, .. } | Load::Bursts { kind, .. } => kind,
+            Load::Replay(_) => Kind::Mix,
+        }
+    }
+
     /// Boots the firmware and opens the device's port.
     pub fn open(self) -> Result<EmulatedPort, AddressError> {
         let image = Image::open(&self.file)?;
-        Ok(EmulatedPort::start(image, self.options, self.pace)?)
+        Ok(EmulatedPort::start(image, self.options, self.manner)?)
     }
+}
+
+/// A whole number: `500000`, `500k`, `1M`.
+fn number(text: &str) -> Option<u32> {
+    let (digits, factor) = match text.as_bytes().last()? {
+        b'k' | b'K' => (&text[..text.len() - 1], 1_000.0),
+        b'M' => (&text[..text.len() - 1], 1_000_000.0),
+        _ => (text, 1.0),
+    };
+    let number = digits.parse::<f64>().ok()? * factor;
+    ((0.0..=f64::from(u32::MAX)).contains(&number) && number.fract() == 0.0).then_some(number as u32)
+}
+
+/// A time in core cycles: `960us`, `20ms`, `1s`.
+fn cycles(text: &str) -> Option<u64> {
+    let unit_at = text.find(|symbol: char| symbol.is_ascii_alphabetic())?;
+    let factor = match &text[unit_at..] {
+        "us" => 1e-6,
+        "ms" => 1e-3,
+        "s" => 1.0,
+        _ => return None,
+    };
+    let seconds = text[..unit_at].parse::<f64>().ok().filter(|number| (0.0..1e6).contains(number))? * factor;
+    Some((seconds * CYCLES_PER_SECOND as f64) as u64).filter(|cycles| *cycles > 0)
 }
 
 #[cfg(test)]
@@ -144,7 +214,7 @@ mod tests {
     fn options_follow_the_file() {
         let address: Address = "a,b.elf,load=50%,frames=std8,seed=7,channels=2,pace=real".parse().unwrap();
         assert_eq!(address.file, PathBuf::from("a,b.elf"));
-        assert_eq!((address.options.seed, address.pace), (7, Pace::RealTime));
+        assert_eq!((address.options.seed, address.manner.pace), (7, Pace::RealTime));
         assert_eq!(address.options.channels, [Channel::Can2]);
         let load = Load::Frames { kind: Kind::Std8, percent: 50.0 };
         assert_eq!(format!("{:?}", address.options.load), format!("{load:?}"));
@@ -153,10 +223,14 @@ mod tests {
     #[test]
     fn options_that_do_not_fit_are_named() {
         for (text, what) in [
-            ("a.elf,speed=9", "no option 'speed'"),
+            ("a.elf,colour=9", "no option 'colour'"),
             ("a.elf,load=101", "0 to 100"),
             ("a.elf,frames=fd", "std0"),
-            ("a.elf,bitrate=1000001", "1000001 bit/s"),
+            ("a.elf,bitrate=1000001", "5k to 1M"),
+            ("a.elf,burst=0/20ms", "10/960us"),
+            ("a.elf,burst=1/20", "10/960us"),
+            ("a.elf,speed=0", "real time"),
+            ("a.elf,wire=cut", "apart or joined"),
             ("a.elf,pace=slow", "client or real"),
             ("a.elf,log=no.log", "no.log"),
         ] {

@@ -1,8 +1,8 @@
 //! The emulated device as somebody else's serial port: behind a pseudo-terminal, or behind a reader and a
 //! writer in this process.
 //!
-//! Emulated time follows the clock on the wall and never runs ahead of it; under full load it falls
-//! behind. What happens when the client does not read is [`Pace`]'s question.
+//! Emulated time follows the clock on the wall, or a share of it, and never runs ahead of it; under full load it
+//! falls behind. What happens when the client does not read is [`Pace`]'s question.
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
@@ -13,11 +13,11 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::CYCLES_PER_SECOND;
-use crate::bus::BitTime;
+use crate::bus::{BitTime, BusFrame};
 use crate::elf::Image;
 use crate::machine::Setup;
 use crate::rig::{MS, Rig, RigError};
-use crate::run::{DEFAULT_BITRATE_BPS, Options};
+use crate::run::{DEFAULT_BITRATE_BPS, Load, Options};
 use crate::traffic::Script;
 use cantap_wire::{CHANNELS, Channel};
 
@@ -28,6 +28,49 @@ pub enum Pace {
     Client,
     /// Time goes on, and the device's queue fills.
     RealTime,
+}
+
+/// How a device is served.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Manner {
+    /// What happens while the client does not read.
+    pub pace: Pace,
+    /// Emulated time passes at most so many times as fast as the wall's. A client on a busy machine has more time for
+    /// each emulated millisecond if this is small.
+    pub speed: f64,
+    /// Both channels on one bus.
+    pub joined: bool,
+    /// The simulated nodes acknowledge.
+    pub acknowledge: bool,
+    /// Share of the frames that are destroyed and sent again, in per cent.
+    pub error_percent: f64,
+    /// Keep every frame that crosses a bus for [`Witness::frames`].
+    pub witness: bool,
+}
+
+impl Default for Manner {
+    /// The client sets the pace, up to real time; two buses, and nothing is kept.
+    fn default() -> Self {
+        Self {
+            pace: Pace::Client,
+            speed: 1.0,
+            joined: false,
+            acknowledge: true,
+            error_percent: 0.0,
+            witness: false,
+        }
+    }
+}
+
+/// What really happened on the buses, whatever the device says of it.
+#[derive(Clone, Debug, Default)]
+pub struct Witness {
+    /// Core cycle up to which it was seen.
+    pub now: u64,
+    /// Frames that crossed each bus, if [`Manner::witness`] was asked for.
+    pub frames: [Vec<BusFrame>; CHANNELS],
+    /// Bits that each controller has driven dominant since power-on.
+    pub dominant_bits: [u64; CHANNELS],
 }
 
 /// Pieces that wait for a reader in this process; each is what the device sent in a millisecond.
@@ -61,8 +104,9 @@ impl Client for crate::pty::Pty {
 /// An emulated device with its port open, and traffic on the buses of its open channels.
 pub struct Served {
     rig: Rig,
-    pace: Pace,
+    manner: Manner,
     options: Options,
+    witness: Arc<Mutex<Witness>>,
     /// Cycles of a bit of each channel that is open.
     open: [Option<u64>; CHANNELS],
     /// When the first of the channels that are open was opened: what is replayed begins then.
@@ -71,20 +115,45 @@ pub struct Served {
 }
 
 impl Served {
-    /// Boots the firmware, enumerates the device and opens its port. A channel's bus carries the traffic of
-    /// `options` as long as the channel is open.
-    pub fn start(image: Image, options: Options, pace: Pace) -> Result<Self, RigError> {
-        let mut rig = Rig::new(image, Setup::default(), options.timing);
+    /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
+    /// of `options` from now on, any other and a replayed log as long as the channel is open.
+    pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
+        let setup = Setup { joined: manner.joined, ..Setup::default() };
+        let mut rig = Rig::new(image, setup, options.timing);
         rig.plug_in()?;
+        let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
+        let now = rig.now();
         for channel in Channel::ALL {
-            let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
-            rig.add_traffic(channel, bitrate_bps, Script::new(Vec::new()));
+            if options.channels.contains(&channel) && Self::is_independent(&options) {
+                rig.add_traffic(channel, bitrate_bps, options.source(channel, now, now, u64::MAX));
+            } else {
+                rig.add_traffic(channel, bitrate_bps, Script::new(Vec::new()));
+            }
         }
-        Ok(Self { rig, pace, options, open: [None; CHANNELS], origin: 0, waiting: VecDeque::new() })
+        for wire in &mut rig.machine.board().wires {
+            (0..wire.node_count()).for_each(|n| wire.node(n).acknowledge(manner.acknowledge));
+            wire.make_noise(manner.error_percent / 100.0, options.seed);
+        }
+        let witness = Arc::default();
+        let (open, origin, waiting) = ([None; CHANNELS], 0, VecDeque::new());
+        Ok(Self { rig, manner, options, witness, open, origin, waiting })
+    }
+
+    /// Whether the buses' traffic goes on whoever opens and closes the channels.
+    fn is_independent(options: &Options) -> bool {
+        options.bitrate_bps.is_some() && !matches!(options.load, Load::Replay(_))
+    }
+
+    /// Where to see what really happens on the buses.
+    pub fn witness(&self) -> Arc<Mutex<Witness>> {
+        Arc::clone(&self.witness)
     }
 
     /// Starts and ends the traffic of channels that were opened and closed.
     fn follow_channels(&mut self) {
+        if Self::is_independent(&self.options) {
+            return;
+        }
         for channel in Channel::ALL {
             let bit = self.rig.bit_cycles(channel);
             if bit == self.open[channel.index()] {
@@ -110,17 +179,18 @@ impl Served {
     pub fn until(&mut self, seconds: Option<Duration>, client: &impl Client) -> Result<(), ServeError> {
         let cycles = seconds.map(|seconds| (seconds.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64);
         let end = cycles.map_or(u64::MAX, |cycles| self.rig.now().saturating_add(cycles));
+        let millisecond = Duration::from_millis(1).div_f64(self.manner.speed);
         let mut due = Instant::now();
         while self.rig.now() < end {
             self.hand_over(client)?;
             let lags = !self.waiting.is_empty();
-            if lags && self.pace == Pace::Client {
+            if lags && self.manner.pace == Pace::Client {
                 std::thread::sleep(LAG_WAIT);
                 due = Instant::now();
                 continue;
             }
             self.millisecond(!lags)?;
-            due += Duration::from_millis(1);
+            due += millisecond;
             let now = Instant::now();
             match due.checked_duration_since(now) {
                 Some(ahead) => {
@@ -137,12 +207,25 @@ impl Served {
     /// One emulated millisecond. A port that is not read is left alone by the host's driver.
     fn millisecond(&mut self, reading: bool) -> Result<(), RigError> {
         self.rig.with_host(|host, _| host.read(reading));
-        let bytes = self.rig.run_unbooked(MS)?;
+        let (bytes, crossed) = self.rig.run_watched(MS)?;
+        self.testify(crossed);
         self.follow_channels();
         self.waiting.extend(bytes);
         // The client cannot see a device that comes back by itself after a reset: its port stays.
         self.rig.with_host(|host, _| host.open_port());
         Ok(())
+    }
+
+    /// Writes down what happened on the buses.
+    fn testify(&self, crossed: [Vec<BusFrame>; CHANNELS]) {
+        let mut witness = self.witness.lock().unwrap_or_else(PoisonError::into_inner);
+        witness.now = self.rig.now();
+        witness.dominant_bits = Channel::ALL.map(|channel| self.rig.dominant_bits(channel));
+        if self.manner.witness {
+            for (all, new) in witness.frames.iter_mut().zip(crossed) {
+                all.extend(new);
+            }
+        }
     }
 
     /// Moves bytes in both directions.
@@ -215,7 +298,7 @@ pub struct EmulatedPort {
 
 impl EmulatedPort {
     /// Boots `image` and opens its port; returns when a host would see it.
-    pub fn start(image: Image, options: Options, pace: Pace) -> Result<Self, ServeError> {
+    pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, ServeError> {
         let (to_client, from_device) = sync_channel(PIECES);
         let (to_device, from_client) = sync_channel(PIECES);
         let (started, ready) = sync_channel(1);
@@ -224,21 +307,21 @@ impl EmulatedPort {
         let channels = Channels { to_client, from_client, stop: Arc::clone(&stop) };
         let last_words = Arc::clone(&end);
         let thread = std::thread::Builder::new().name("cantap-emulation".to_owned()).spawn(move || {
-            let mut served = match Served::start(image, options, pace) {
+            let mut served = match Served::start(image, options, manner) {
                 Ok(served) => served,
                 Err(error) => {
                     let _ = started.send(Err(error));
                     return;
                 }
             };
-            let _ = started.send(Ok(()));
+            let _ = started.send(Ok(served.witness()));
             if let Err(ServeError::Rig(error)) = served.until(None, &channels) {
                 *last_words.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
             }
         })?;
-        let device = EmulatedDevice { stop, thread: Some(thread) };
         // The thread ends only after it has said one or the other.
-        ready.recv().map_err(|_| io::Error::other("the emulation ended before it began"))??;
+        let said = ready.recv().map_err(|_| io::Error::other("the emulation ended before it began"))?;
+        let device = EmulatedDevice { stop, thread: Some(thread), witness: said? };
         Ok(Self {
             reader: PortReader { pieces: from_device, rest: VecDeque::new(), end },
             writer: PortWriter(to_device),
@@ -294,6 +377,14 @@ impl Write for PortWriter {
 pub struct EmulatedDevice {
     stop: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+    witness: Arc<Mutex<Witness>>,
+}
+
+impl EmulatedDevice {
+    /// Where to see what really happens on the buses.
+    pub fn witness(&self) -> Arc<Mutex<Witness>> {
+        Arc::clone(&self.witness)
+    }
 }
 
 impl Drop for EmulatedDevice {

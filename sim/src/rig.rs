@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use cantap_wire::message::{ChannelConfig, Hello, Status};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Record, Refusal, Reply, Response};
 
-use crate::bus::{BitTime, Node, Source};
+use crate::bus::{BitTime, BusFrame, Node, Source, Wire};
 use crate::capture::{Heard, Ledger, Session};
 use crate::elf::Image;
 use crate::machine::{Machine, Setup};
@@ -139,11 +139,14 @@ impl Rig {
 
     /// Runs for `cycles` for a host of somebody else's: returns what the device sent and keeps no books.
     pub fn run_unbooked(&mut self, cycles: u64) -> Result<Vec<u8>, RigError> {
+        self.run_watched(cycles).map(|(bytes, _)| bytes)
+    }
+
+    /// The same, with what crossed each bus.
+    pub fn run_watched(&mut self, cycles: u64) -> Result<(Vec<u8>, [Vec<BusFrame>; CHANNELS]), RigError> {
         self.machine.run_until(self.now() + cycles)?;
-        for wire in &mut self.machine.board().wires {
-            drop(wire.take_history());
-        }
-        Ok(self.with_host(|host, _| host.receive()))
+        let crossed = self.machine.board().wires.each_mut().map(Wire::take_history);
+        Ok((self.with_host(|host, _| host.receive()), crossed))
     }
 
     /// Runs while `goes_on` says so, asking once a millisecond; whether it ended before `limit` cycles were over.

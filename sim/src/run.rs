@@ -14,7 +14,7 @@ use crate::machine::{Machine, Setup};
 use crate::rig::{MS, Rig, RigError};
 use crate::soc::{CAN_IRQS, OddAccess};
 use crate::trace::Trace;
-use crate::traffic::{Kind, Script, Traffic};
+use crate::traffic::{Bursts, Kind, Script, Traffic};
 use crate::usb_host::Timing;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 
@@ -36,6 +36,15 @@ pub enum Load {
         kind: Kind,
         /// 0 to 100; 100 is back to back.
         percent: f64,
+    },
+    /// Seeded frames of a kind in bursts.
+    Bursts {
+        /// Which.
+        kind: Kind,
+        /// Frames in a burst, back to back.
+        frames: u32,
+        /// From burst to burst, in core cycles.
+        period: u64,
     },
     /// Recorded frames for each channel, at times in core cycles after the first.
     Replay([Vec<(u64, Frame)>; CHANNELS]),
@@ -205,11 +214,12 @@ impl Options {
     /// The traffic of a channel's bus, from core cycle `from` to `until`. What is replayed has its first frame at
     /// `origin`.
     pub fn source(&self, channel: Channel, origin: u64, from: u64, until: u64) -> Box<dyn Source> {
+        // Two channels of one seed must not carry the same frames.
+        let seed = self.seed.wrapping_mul(CHANNELS as u64).wrapping_add(channel.index() as u64);
         match &self.load {
-            Load::Frames { kind, percent } => {
-                // Two channels of one seed must not carry the same frames.
-                let seed = self.seed.wrapping_mul(CHANNELS as u64).wrapping_add(channel.index() as u64);
-                Box::new(Traffic::new(*kind, seed, *percent, from, until))
+            Load::Frames { kind, percent } => Box::new(Traffic::new(*kind, seed, *percent, from, until)),
+            Load::Bursts { kind, frames, period } => {
+                Box::new(Bursts::new(*kind, seed, *frames, *period, from, until))
             }
             Load::Replay(logs) => {
                 let frames = logs[channel.index()].iter().map(|(at, frame)| (origin + at, *frame));

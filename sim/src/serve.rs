@@ -9,11 +9,11 @@ use cantap_sim::run::Options;
 /// Serves the device until it fails or `seconds` of emulated time are over.
 #[cfg(unix)]
 pub fn pty(image: Image, options: Options, seconds: Option<Duration>, real_time: bool) -> anyhow::Result<()> {
-    use cantap_sim::link::{Pace, Served};
+    use cantap_sim::link::{Manner, Pace, Served};
     use cantap_sim::pty::Pty;
 
     let pace = if real_time { Pace::RealTime } else { Pace::Client };
-    let mut served = Served::start(image, options, pace)?;
+    let mut served = Served::start(image, options, Manner { pace, ..Manner::default() })?;
     let pty = Pty::open()?;
     let mut out = io::stdout().lock();
     writeln!(out, "{}", pty.name())?;

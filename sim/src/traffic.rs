@@ -130,6 +130,37 @@ impl Source for Traffic {
     }
 }
 
+/// Bursts of frames, back to back, at a fixed period.
+pub struct Bursts {
+    frames: Frames,
+    in_burst: u32,
+    left: u32,
+    period: u64,
+    at: u64,
+    until: u64,
+}
+
+impl Bursts {
+    /// Bursts of `in_burst` frames of `kind` from `seed` each `period` core cycles, from core cycle `from` to `until`.
+    pub fn new(kind: Kind, seed: u64, in_burst: u32, period: u64, from: u64, until: u64) -> Self {
+        Self { frames: Frames::new(kind, seed), in_burst, left: in_burst, period, at: from, until }
+    }
+}
+
+impl Source for Bursts {
+    fn next_frame(&mut self, _bit: BitTime) -> Option<(u64, Frame)> {
+        if self.left == 0 {
+            self.left = self.in_burst;
+            self.at += self.period;
+        }
+        if self.at >= self.until || self.in_burst == 0 {
+            return None;
+        }
+        self.left -= 1;
+        Some((self.at, self.frames.next_frame()))
+    }
+}
+
 /// Frames at given core cycles, in order.
 pub struct Script(std::vec::IntoIter<(u64, Frame)>);
 

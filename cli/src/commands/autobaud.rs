@@ -74,7 +74,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "no traffic on channel {} in {seconds:.1} s; check the wiring, and that the bus is awake and has two nodes",
             args.channel.number()
         ),
-        Outcome::NoMatch { errors } => bail!(
+        Outcome::NoMatch { about_bps: Some(bps), .. } => bail!(
+            "the bus on channel {} runs at about {bps:.0} bit/s, and no rate that the device's clock reaches is near \
+             enough",
+            args.channel.number()
+        ),
+        Outcome::NoMatch { errors, .. } => bail!(
             "there is traffic on channel {}, but no bit rate fits ({errors} errors): is it classical CAN, are the wires \
              swapped, is the termination right?",
             args.channel.number()

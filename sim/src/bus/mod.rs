@@ -15,6 +15,7 @@ use std::collections::VecDeque;
 
 use cantap_wire::Frame;
 use cantap_wire::record::BusErrorKind;
+use fastrand::Rng;
 
 use crate::can::fault::Counters;
 use crate::can::{CanPair, Mode};
@@ -95,6 +96,8 @@ pub struct Wire {
     flight: Option<Flight>,
     stuck: Option<Stuck>,
     disturbances: VecDeque<(u64, Disturbance)>,
+    /// Share of the frames that are destroyed, 0 to 1, and what decides which.
+    noise: (f64, Rng),
     started: u64,
     history: Vec<BusFrame>,
 }
@@ -116,6 +119,7 @@ impl Wire {
             flight: None,
             stuck: None,
             disturbances: VecDeque::new(),
+            noise: (0.0, Rng::with_seed(0)),
             started: 0,
             history: Vec::new(),
         }
@@ -146,6 +150,11 @@ impl Wire {
     /// Takes the history out, so that a long run needs little memory.
     pub fn take_history(&mut self) -> Vec<BusFrame> {
         std::mem::take(&mut self.history)
+    }
+
+    /// Destroys a share of all frames from now on, 0 to 1, each at a bit that `seed` decides.
+    pub fn make_noise(&mut self, share: f64, seed: u64) {
+        self.noise = (share, Rng::with_seed(seed));
     }
 
     /// Disturbs the frame that starts after `frames` more.

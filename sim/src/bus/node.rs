@@ -82,6 +82,11 @@ impl Node {
         Self { acknowledges: false, ..self }
     }
 
+    /// Whether it acknowledges, from now on.
+    pub fn acknowledge(&mut self, acknowledge: bool) {
+        self.acknowledges = acknowledge;
+    }
+
     /// With frames from `source` whenever its queue is empty.
     #[must_use]
     pub fn with_source(self, source: impl Source + 'static) -> Self {

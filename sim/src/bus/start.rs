@@ -200,9 +200,17 @@ impl Wire {
     }
 
     fn take_disturbance(&mut self) -> Option<Disturbance> {
-        self.disturbances
-            .pop_front_if(|(frame, _)| *frame <= self.started)
-            .map(|(_, disturbance)| disturbance)
+        /// A bit of the identifier or the control field, which every frame has.
+        const NOISY_BITS: std::ops::Range<usize> = 1..19;
+        let planned = self.disturbances.pop_front_if(|(frame, _)| *frame <= self.started);
+        let (share, random) = &mut self.noise;
+        match planned {
+            Some((_, disturbance)) => Some(disturbance),
+            None if *share > 0.0 && random.f64() < *share => {
+                Some(Disturbance::Bit { index: random.usize(NOISY_BITS) })
+            }
+            None => None,
+        }
     }
 
     /// Sequences of eleven recessive bits since the last frame, for controllers in bus-off.

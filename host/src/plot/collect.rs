@@ -321,7 +321,13 @@ fn add_window(window: &Window, axis: &mut TimeAxis, channels: &mut Vec<(u8, Curv
         channels.push((window.channel, curve));
         channels.len() - 1
     });
-    let y = if in_per_cent { window.load_pct.unwrap_or(f64::NAN) } else { window.frames_per_s() };
+    let y = match window.load_pct {
+        // All its frames are missing: nothing is known. One that lacks some is drawn, as the lower bound that it is.
+        _ if window.incomplete && window.frames == 0 => f64::NAN,
+        Some(load) if in_per_cent => load,
+        _ if in_per_cent => f64::NAN,
+        _ => window.frames_per_s(),
+    };
     let series = &mut channels[place].1.series;
     series.push(axis.seconds(window.start_ns).max(0.0), y);
     series.push(axis.seconds(window.start_ns.saturating_add(window.length_ns as i64)), y);
@@ -484,6 +490,21 @@ mod tests {
         let points = plot.panes[0].content.curves()[0].series.points();
         assert!(points.iter().all(|point| (point.y - 50.0).abs() < 6.0), "{points:?}");
         assert!(matches!(plot.panes[0].range, Some((0.0, 50.0 | 100.0))));
+    }
+
+    #[test]
+    fn load_is_not_drawn_where_all_frames_are_missing() {
+        let options = Options { window: std::time::Duration::from_millis(10), ..Options::default() };
+        let mut collector = LoadCollector::new(options).unwrap();
+        for record in [frame(0, "123#"), frame(12, "123#"), lost(55, 9), frame(55, "123#"), frame(75, "123#")]
+        {
+            collector.push(&record);
+        }
+        let plot = collector.finish(String::new());
+        let points = plot.panes[0].content.curves()[0].series.points();
+        let missing = points.iter().filter(|point| point.y.is_nan()).count();
+        assert!(missing > 0, "{points:?}");
+        assert!(points.iter().all(|point| !(0.021..0.049).contains(&point.x)), "{points:?}");
     }
 
     #[test]

@@ -148,6 +148,9 @@ impl ChannelStatistics {
             self.out_of_order += 1;
         }
         self.latest_ns = time_ns;
+        if matches!(record.event, TraceEvent::Lost { .. }) {
+            self.interrupt();
+        }
         self.windows.advance(time_ns, closed);
         match record.event {
             TraceEvent::Frame { frame, direction, late } => {
@@ -178,7 +181,6 @@ impl ChannelStatistics {
                 self.losses.gaps += 1;
                 self.losses.at_least |= at_least;
                 self.windows.lost(u64::from(count));
-                self.interrupt();
             }
             TraceEvent::TransmitFailed { .. } => self.transmit_failures += 1,
         }
@@ -219,6 +221,7 @@ impl ChannelStatistics {
     /// The interval from the last frame to the next one says nothing.
     fn interrupt(&mut self) {
         self.gaps = self.gaps.wrapping_add(1);
+        self.windows.gap();
         if let Some(load) = &mut self.load {
             load.gap();
         }
@@ -258,9 +261,15 @@ impl ChannelStatistics {
         per_second(self.frames.saturating_sub(1), self.covered_ns)
     }
 
-    /// Least, mean and largest load of the whole windows that are over, in per cent; `None` without a bit rate.
-    pub fn window_extremes_pct(&self) -> Option<(f64, f64, f64)> {
-        self.windows.extremes()
+    /// Least and mean load of the whole windows that are over and from which no frame is missing, in per cent; `None`
+    /// without a bit rate or such a window.
+    pub fn window_least_and_mean_pct(&self) -> Option<(f64, f64)> {
+        self.windows.least_and_mean_pct()
+    }
+
+    /// Largest load of a whole window that is over, in per cent: a lower bound, if frames are missing from it.
+    pub fn window_largest_pct(&self) -> Option<f64> {
+        self.windows.largest_pct()
     }
 
     /// The busiest windows that are over, the busiest first.

@@ -56,12 +56,16 @@ impl WorkLoad {
     #[inline]
     pub fn frame(&mut self, end_ns: i64, bits: u32) {
         if let Some(previous) = self.previous_ns.replace(end_ns)
-            && let Ok(interval @ 1..) = u64::try_from(end_ns.saturating_sub(previous))
+            && let Ok(interval) = u64::try_from(end_ns.saturating_sub(previous))
         {
+            // Where stamps are coarse, frames share one: together they took the interval before or behind them.
+            self.bits += u64::from(bits);
+            if interval == 0 {
+                return;
+            }
             let instant = self.share(u64::from(bits), interval);
             self.instant_pct = Some(instant);
             self.instant_max_pct = Some(self.instant_max_pct.map_or(instant, |max| max.max(instant)));
-            self.bits += u64::from(bits);
             // A file may say anything about times.
             self.span_ns = self.span_ns.saturating_add(interval);
         }
@@ -110,8 +114,10 @@ pub struct Window {
     pub bits: u64,
     /// Error frames seen in it.
     pub errors: u64,
-    /// Frames lost in it: with any, the load is a lower bound.
+    /// Lost frames whose record stands in it.
     pub lost: u64,
+    /// Whether frames are missing from it, or may be: its figures are lower bounds.
+    pub incomplete: bool,
     /// Load in per cent, frames that cross its borders in part, error frames with their least length; `None`
     /// without a bit rate.
     pub load_pct: Option<f64>,
@@ -128,6 +134,7 @@ impl Window {
             bits: 0,
             errors: 0,
             lost: 0,
+            incomplete: false,
             load_pct: None,
             busy_ns: 0,
         }
@@ -164,6 +171,9 @@ pub(super) struct Windows {
     /// A window that waits for a frame that may have begun in it.
     pending: Option<Window>,
     peaks: Peaks,
+    /// Frames are missing from here to the next one.
+    in_gap: bool,
+    /// Windows that are over and complete.
     whole: u64,
     load_min: f64,
     load_sum: f64,
@@ -186,6 +196,7 @@ impl Windows {
             carry_ns: 0,
             pending: None,
             peaks: Peaks::new(peaks),
+            in_gap: false,
             whole: 0,
             load_min: f64::INFINITY,
             load_sum: 0.0,
@@ -244,8 +255,10 @@ impl Windows {
             // Hours of silence are as many equal empty windows: counted, but not reported one by one.
             if steps > MOST_SILENT_WINDOWS && self.current.is_empty() {
                 let silent = steps - 1;
-                self.whole += silent as u64;
-                self.load_min = 0.0;
+                if !self.in_gap {
+                    self.whole += silent as u64;
+                    self.load_min = 0.0;
+                }
                 self.current.start_ns = self.current.start_ns.saturating_add(silent * length);
                 steps = 1;
             }
@@ -253,6 +266,7 @@ impl Windows {
             let start = self.current.start_ns.saturating_add(length);
             let mut window = Window::new(self.current.channel, start, self.length_ns);
             window.busy_ns = std::mem::take(&mut self.carry_ns);
+            window.incomplete = self.in_gap;
             self.pending = Some(std::mem::replace(&mut self.current, window));
             steps -= 1;
         }
@@ -261,6 +275,7 @@ impl Windows {
     /// A frame of `bits` that ended at `end_ns`. [`Self::advance`] to `end_ns` comes first.
     #[inline]
     pub(super) fn frame(&mut self, end_ns: i64, bits: u32, closed: &mut impl FnMut(&Window)) {
+        self.in_gap = false;
         self.current.frames += 1;
         self.current.bits += u64::from(bits);
         let Some(bitrate) = self.bitrate_bps else {
@@ -290,6 +305,18 @@ impl Windows {
         }
     }
 
+    /// Frames are missing between the last one and the next, wherever in this time they were.
+    /// [`Self::advance`] to the time at which that is known comes afterwards.
+    pub(super) fn gap(&mut self) {
+        self.in_gap = true;
+        self.current.incomplete = true;
+        if self.current.frames == 0
+            && let Some(pending) = &mut self.pending
+        {
+            pending.incomplete = true;
+        }
+    }
+
     /// Frames that were lost.
     pub(super) fn lost(&mut self, count: u64) {
         self.current.lost += count;
@@ -300,13 +327,22 @@ impl Windows {
             return;
         };
         self.finish_load(&mut window);
+        self.count(&window);
+        closed(&window);
+    }
+
+    /// Takes a window into the extremes. How busy an incomplete one was at least may be a peak, and says nothing of the least
+    /// or the mean.
+    fn count(&mut self, window: &Window) {
+        self.peaks.offer(window);
+        if window.incomplete {
+            return;
+        }
         self.whole += 1;
         if let Some(load) = window.load_pct {
             self.load_min = self.load_min.min(load);
             self.load_sum += load;
         }
-        self.peaks.offer(&window);
-        closed(&window);
     }
 
     fn finish_load(&self, window: &mut Window) {
@@ -338,20 +374,20 @@ impl Windows {
             return;
         }
         if self.whole == 0 {
-            self.peaks.offer(&rest);
-            if let Some(load) = rest.load_pct {
-                self.whole = 1;
-                self.load_min = load;
-                self.load_sum = load;
-            }
+            self.count(&rest);
         }
         closed(&rest);
     }
 
-    /// Least, mean and largest load of the whole windows, in per cent.
-    pub(super) fn extremes(&self) -> Option<(f64, f64, f64)> {
-        let max = self.peaks.best.front()?.load_pct?;
-        Some((self.load_min, self.load_sum / self.whole.max(1) as f64, max))
+    /// Least and mean load of the whole windows from which no frame is missing, in per cent.
+    pub(super) fn least_and_mean_pct(&self) -> Option<(f64, f64)> {
+        (self.bitrate_bps.is_some() && self.whole > 0)
+            .then(|| (self.load_min, self.load_sum / self.whole as f64))
+    }
+
+    /// Largest load of a whole window, in per cent: at least so much, if frames are missing from it.
+    pub(super) fn largest_pct(&self) -> Option<f64> {
+        self.peaks.best.front()?.load_pct
     }
 
     /// The busiest windows, the busiest first.
@@ -426,9 +462,43 @@ mod tests {
         assert_eq!(load.instant_pct(), None);
         load.frame(10_116_000, 58);
         assert_eq!(load.instant_pct(), Some(50.0));
-        // Stamps that do not advance say nothing.
+        // A stamp that does not advance has no interval of its own.
         load.frame(10_116_000, 58);
         assert_eq!(load.instant_pct(), Some(50.0));
+    }
+
+    #[test]
+    fn coarse_stamps_change_the_mean_work_load_by_no_more_than_its_ends() {
+        let mut load = WorkLoad::new(1_000_000);
+        for n in 0..17_241 {
+            // Back to back for a second, stamped every millisecond.
+            load.frame((n * 58_000) / 1_000_000 * 1_000_000, 58);
+        }
+        assert!((load.mean_pct().unwrap() - 100.0).abs() < 0.2, "{:?}", load.mean_pct());
+    }
+
+    #[test]
+    fn windows_between_the_last_frame_and_a_loss_record_are_incomplete_and_count_for_no_mean() {
+        let mut windows = windows(1_000_000);
+        let mut seen = Vec::new();
+        for end in [500_000, 1_500_000, 2_500_000] {
+            windows.advance(end, &mut |window| seen.push(*window));
+            windows.frame(end, 100, &mut |window| seen.push(*window));
+        }
+        windows.gap();
+        windows.advance(5_500_000, &mut |window| seen.push(*window));
+        windows.lost(7);
+        for end in [5_500_000, 6_500_000] {
+            windows.advance(end, &mut |window| seen.push(*window));
+            windows.frame(end, 100, &mut |window| seen.push(*window));
+        }
+        windows.finish(8_000_000, &mut |window| seen.push(*window));
+        let incomplete: Vec<_> = seen.iter().map(|window| window.incomplete).collect();
+        assert_eq!(incomplete, [false, false, true, true, true, true, false, false]);
+        let lost: Vec<_> = seen.iter().map(|window| window.lost).collect();
+        assert_eq!(lost, [0, 0, 0, 0, 0, 7, 0, 0]);
+        let (min, mean) = windows.least_and_mean_pct().unwrap();
+        assert!(min.abs() < 1e-9 && (mean - 7.5).abs() < 1e-9, "{min} {mean}");
     }
 
     fn windows(bitrate_bps: u32) -> Windows {
@@ -483,7 +553,8 @@ mod tests {
         assert_eq!((running.start_ns, running.frames), (year, 1));
         assert!(count < 200_000, "{count}");
         assert_eq!(windows.whole, year as u64 / 1_000_000);
-        let (min, mean, max) = windows.extremes().unwrap();
+        let (min, mean) = windows.least_and_mean_pct().unwrap();
+        let max = windows.largest_pct().unwrap();
         assert!(min.abs() < 1e-12 && mean < 1e-6 && (max - 5.8).abs() < 1e-9);
     }
 

@@ -90,11 +90,11 @@ pub struct LoadSummary {
     pub instant_max_pct: Option<f64>,
     /// Work load over all intervals.
     pub mean_pct: Option<f64>,
-    /// Load of the least busy window.
+    /// Load of the least busy window from which no frame is missing.
     pub window_min_pct: Option<f64>,
-    /// Mean over the windows, error frames counted.
+    /// Mean over the windows from which no frame is missing, error frames counted.
     pub window_mean_pct: Option<f64>,
-    /// Load of the busiest window.
+    /// Load of the busiest window; a lower bound, if frames are missing from it.
     pub window_max_pct: Option<f64>,
 }
 
@@ -117,8 +117,10 @@ pub struct PeakSummary {
     pub bits_per_s: f64,
     /// Error frames.
     pub errors: u64,
-    /// Lost frames.
+    /// Lost frames whose record stands in it.
     pub lost: u64,
+    /// Whether frames are missing from it, or may be: its figures are lower bounds.
+    pub incomplete: bool,
 }
 
 /// Errors by kind.
@@ -220,14 +222,14 @@ impl ChannelSummary {
     fn of(channel: &ChannelStatistics) -> Self {
         let mut ids: Vec<_> = channel.ids().collect();
         ids.sort_by_key(|id| (id.id.is_extended(), id.id.raw()));
-        let extremes = channel.window_extremes_pct();
+        let windows = channel.window_least_and_mean_pct();
         let load = channel.load.as_ref().map(|load| LoadSummary {
             instant_pct: load.instant_pct(),
             instant_max_pct: load.instant_max_pct(),
             mean_pct: load.mean_pct(),
-            window_min_pct: extremes.map(|(min, ..)| min),
-            window_mean_pct: extremes.map(|(_, mean, _)| mean),
-            window_max_pct: extremes.map(|(.., max)| max),
+            window_min_pct: windows.map(|(least, _)| least),
+            window_mean_pct: windows.map(|(_, mean)| mean),
+            window_max_pct: channel.window_largest_pct(),
         });
         // As for frames: the first frame's bits lie before the span.
         let span = channel.covered_ns();
@@ -285,6 +287,7 @@ impl PeakSummary {
             bits_per_s: window.bits_per_s(),
             errors: window.errors,
             lost: window.lost,
+            incomplete: window.incomplete,
         }
     }
 }

@@ -120,5 +120,8 @@ fn line(window: &Window, colour: bool) -> String {
     if window.lost > 0 {
         let _ = write!(text, " {} lost", window.lost);
     }
+    if window.incomplete {
+        text.push_str(", frames are missing");
+    }
     text
 }

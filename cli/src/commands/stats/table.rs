@@ -58,7 +58,8 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     );
     if let Some(load) = &channel.load {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
-        let bound = if channel.lost.total > 0 { ", a lower bound where frames were lost" } else { "" };
+        let bound =
+            if channel.lost.total > 0 { ", without the windows from which frames are missing" } else { "" };
         let _ = writeln!(
             out,
             "  load      mean {}, last {}, highest between two frames {}",
@@ -150,6 +151,9 @@ fn window_lines(windows: &[PeakSummary], reference: Option<&ChannelSummary>, out
         }
         if window.lost > 0 {
             let _ = write!(out, " {} lost", window.lost);
+        }
+        if window.incomplete {
+            out.push_str(", frames are missing");
         }
         out.push('\n');
     }

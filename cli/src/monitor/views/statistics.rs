@@ -129,7 +129,7 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
     let bar: String = (0..columns).map(|column| if column < filled { full } else { empty }).collect();
     let percent = |value: Option<f64>| value.map_or("-".to_owned(), |value| format!("{value:.1} %"));
     let work = channel.load.as_ref();
-    let peak = channel.window_extremes_pct().map(|(_, _, max)| max);
+    let peak = channel.window_largest_pct();
     // What was lost is not in it.
     let bound = match (channel.losses.total(), app.theme.unicode) {
         (0, _) => "",

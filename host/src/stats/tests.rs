@@ -132,7 +132,7 @@ fn no_window_and_no_rate_spans_an_interruption() {
     assert!(windows.iter().all(|window| window.frames >= 9), "{windows:?}");
     let channel = &statistics.channels()[0];
     assert!((channel.frames_per_s() - 10.0).abs() < 0.5, "{}", channel.frames_per_s());
-    assert!(channel.window_extremes_pct().unwrap().0 > 0.05);
+    assert!(channel.window_least_and_mean_pct().unwrap().0 > 0.05);
     // Interrupted for good.
     statistics.interrupt();
     statistics.finish_with(|window| panic!("{window:?}"));

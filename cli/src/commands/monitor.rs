@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
+use anyhow::Context;
 use cantap::Address;
 use cantap::filter::Filter;
 use cantap::signals::Decoder;
@@ -20,7 +21,7 @@ use crate::monitor::model::Model;
 use crate::monitor::profile::Profile;
 use crate::monitor::source::{Order, Origin, Plan};
 use crate::monitor::theme::Theme;
-use crate::monitor::{once, orders, run as show};
+use crate::monitor::{once, orders, picture, run as show, text};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -65,9 +66,12 @@ pub struct Args {
     /// Colours for a light background.
     #[arg(long)]
     light: bool,
-    /// Print one screen and leave.
+    /// Print one screen as text and leave.
     #[arg(long)]
     once: bool,
+    /// With --once: write the screen to this file as an SVG picture instead, with its colours.
+    #[arg(long, value_name = "FILE", requires = "once")]
+    svg: Option<PathBuf>,
     /// With --once: look at a device for so long.
     #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
     time: Duration,
@@ -121,8 +125,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         for complaint in complaints {
             eprintln!("cantap: {complaint}");
         }
-        let text = once(origin, app, model, receiver, args.size, args.time)?;
-        std::io::stdout().lock().write_all(text.as_bytes())?;
+        let screen = once(origin, app, model, receiver, args.size, args.time)?;
+        match &args.svg {
+            None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
+            Some(path) => std::fs::write(path, picture::svg(&screen))
+                .with_context(|| format!("cannot write {}", path.display()))?,
+        }
     } else {
         model.notice = complaints.join("; ");
         show(origin, app, model, receiver)?;

@@ -3,6 +3,7 @@
 
 pub mod app;
 pub mod model;
+pub mod picture;
 pub mod profile;
 mod recorder;
 mod screen;
@@ -134,7 +135,7 @@ impl Stops {
     }
 }
 
-/// Looks for so long (a file: to its end), then gives the screen as text.
+/// Looks for so long (a file: to its end), then gives the screen.
 pub fn once(
     origin: Origin,
     mut app: App,
@@ -142,7 +143,7 @@ pub fn once(
     orders: std::sync::mpsc::Receiver<Order>,
     size: (u16, u16),
     time: Duration,
-) -> anyhow::Result<String> {
+) -> anyhow::Result<Buffer> {
     let is_file = matches!(origin, Origin::File(_));
     let model: Shared = Arc::new(Mutex::new(model));
     let thread = start(origin, &model, orders)?;
@@ -163,22 +164,23 @@ pub fn once(
         }
     }
     app.catch_up(&mut lock(&model));
-    let text = screen_text(&mut app, &lock(&model), size)?;
+    let screen = screen(&mut app, &lock(&model), size)?;
     let _ = app.orders.send(Order::Quit);
     if thread.join().is_err() {
         bail!("the source thread failed; please report this");
     }
-    Ok(text)
+    Ok(screen)
 }
 
-/// One screen as text, without colours.
-pub fn screen_text(app: &mut App, model: &Model, (width, height): (u16, u16)) -> anyhow::Result<String> {
+/// One screen of this size.
+pub fn screen(app: &mut App, model: &Model, (width, height): (u16, u16)) -> anyhow::Result<Buffer> {
     let mut terminal = Terminal::new(TestBackend::new(width, height))?;
     terminal.draw(|frame| views::draw(frame, app, model))?;
-    Ok(buffer_text(terminal.backend().buffer()))
+    Ok(terminal.backend().buffer().clone())
 }
 
-fn buffer_text(buffer: &Buffer) -> String {
+/// A screen as text, without colours.
+pub fn text(buffer: &Buffer) -> String {
     let mut text = String::new();
     for row in 0..buffer.area.height {
         let line: String = (0..buffer.area.width)

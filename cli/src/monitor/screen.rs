@@ -8,10 +8,11 @@ use anyhow::bail;
 use ratatui::Terminal;
 use ratatui::backend::CrosstermBackend;
 use ratatui::crossterm::event::{DisableMouseCapture, EnableMouseCapture};
-use ratatui::crossterm::execute;
 use ratatui::crossterm::terminal::{
-    Clear, ClearType, EnterAlternateScreen, LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
+    BeginSynchronizedUpdate, Clear, ClearType, EndSynchronizedUpdate, EnterAlternateScreen,
+    LeaveAlternateScreen, disable_raw_mode, enable_raw_mode,
 };
+use ratatui::crossterm::{execute, queue};
 
 use super::app::App;
 use super::model::Model;
@@ -78,8 +79,10 @@ impl Screen {
     }
 
     fn render(&mut self, app: &mut App, model: &Model) -> anyhow::Result<()> {
+        // A terminal that knows this shows the page at once when it is whole.
+        queue!(self.page, BeginSynchronizedUpdate)?;
         self.terminal.draw(|frame| views::draw(frame, app, model))?;
-        Ok(())
+        Ok(queue!(self.page, EndSynchronizedUpdate)?)
     }
 
     /// Stops the program until the shell lets it go on, with the terminal as it was.

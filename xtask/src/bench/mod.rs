@@ -12,6 +12,8 @@ mod formats;
 #[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
+mod monitor;
+#[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
 mod stats;
@@ -39,6 +41,8 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
+    Monitor,
 }
 
 /// What `cargo xtask bench` takes.
@@ -46,6 +50,9 @@ enum Subject {
 pub struct Args {
     /// What to measure; everything if not given.
     subject: Vec<Subject>,
+    /// How long the live view is watched.
+    #[arg(long, value_name = "N", default_value_t = 60)]
+    seconds: u32,
 }
 
 /// Builds this program in release and measures there.
@@ -55,10 +62,14 @@ pub fn run(args: &Args) -> Result<()> {
 
     let shell = crate::workspace::shell()?;
     let subjects = args.subject.iter().filter_map(Subject::to_possible_value);
+    let seconds = args.seconds.to_string();
     let subjects: Vec<String> = subjects.map(|subject| subject.get_name().to_owned()).collect();
-    cmd!(shell, "cargo run --release --quiet -p xtask --features bench -- bench {subjects...}")
-        .quiet()
-        .run()?;
+    cmd!(
+        shell,
+        "cargo run --release --quiet -p xtask --features bench -- bench {subjects...} --seconds {seconds}"
+    )
+    .quiet()
+    .run()?;
     Ok(())
 }
 
@@ -77,6 +88,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Bus => bus::run()?,
             Subject::Host => host::run()?,
             Subject::Stats => stats::run()?,
+            Subject::Monitor => monitor::run(args.seconds)?,
         }
     }
     Ok(())

@@ -5,20 +5,16 @@ use std::sync::Arc;
 use cantap::signals::{Decoder, Source};
 use cantap::stats::Options;
 use cantap::{TraceEvent, TraceRecord};
-use ratatui::Terminal;
-use ratatui::backend::TestBackend;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 
 use super::super::app::{App, View};
 use super::super::model::Model;
-use super::super::views;
+use super::super::screen;
 use super::{app, frame, model, press};
 
 fn buffer(app: &mut App, model: &Model) -> Buffer {
-    let mut terminal = Terminal::new(TestBackend::new(160, 50)).unwrap();
-    terminal.draw(|frame| views::draw(frame, app, model)).unwrap();
-    terminal.backend().buffer().clone()
+    screen(app, model, (160, 50)).unwrap()
 }
 
 /// The colour and the modifiers of a text's first character.

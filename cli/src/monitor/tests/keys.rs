@@ -5,9 +5,8 @@ use cantap::{Channel, TraceRecord};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::super::app::{Flow, TimeMode, View};
-use super::super::screen_text;
 use super::super::source::Order;
-use super::{app, model, press};
+use super::{app, model, press, screen_text};
 
 #[test]
 fn pausing_stops_the_display_but_not_the_model() {

@@ -24,7 +24,7 @@ use super::app::{App, Flow, View};
 use super::model::{DeviceFigures, Model, Recording, SourceState};
 use super::source::{Order, Plan};
 use super::theme::Theme;
-use super::{orders, screen_text};
+use super::{orders, screen, text};
 
 /// A small screen and a wide one.
 const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];
@@ -115,6 +115,10 @@ fn app(view: View) -> (App, Receiver<Order>) {
 
 fn frame(text: &str) -> TraceEvent {
     TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false }
+}
+
+fn screen_text(app: &mut App, model: &Model, size: (u16, u16)) -> anyhow::Result<String> {
+    Ok(text(&screen(app, model, size)?))
 }
 
 fn press(app: &mut App, model: &mut Model, keys: &str) {

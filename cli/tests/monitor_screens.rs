@@ -1,0 +1,90 @@
+//! The documents' pictures of the live view, made by the command from a recorded bus, and `--once` as scripts use it.
+//!
+//! After a change that is meant, write them anew with `CANTAP_OVERWRITE=1 cargo test -p cantap-cli --test
+//! monitor_screens` and look at them.
+
+use std::path::Path;
+use std::process::{Command, Output};
+
+const BOAT: &str = "monitor host/tests/data/nmea2000.log.gz -p docs/screens/boat.toml --once";
+
+fn cantap(arguments: &str) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    command.args(arguments.split_whitespace()).env("LC_ALL", "C.UTF-8").env_remove("NO_COLOR");
+    command.current_dir(Path::new(env!("CARGO_MANIFEST_DIR")).join(".."));
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+#[test]
+fn the_pictures_in_the_documents_are_what_the_command_draws() {
+    let documents = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/screens");
+    let folder = tempfile::tempdir().unwrap();
+    for (page, size) in [("fixed", "100x20"), ("graph", "100x24")] {
+        let drawn = folder.path().join(page);
+        let line = format!("{BOAT} --view {page} --size {size} --svg {}", drawn.display());
+        assert_eq!(cantap(&line), (Some(0), String::new(), String::new()));
+        let drawn = std::fs::read_to_string(drawn).unwrap();
+        let document = documents.join(format!("{page}.svg"));
+        if std::env::var_os("CANTAP_OVERWRITE").is_some() {
+            std::fs::write(&document, &drawn).unwrap();
+        }
+        let shown = std::fs::read_to_string(&document).unwrap_or_default().replace("\r\n", "\n");
+        assert!(drawn == shown, "{} is not what is drawn now", document.display());
+    }
+}
+
+#[test]
+fn one_screen_is_text_of_the_size_that_was_asked_for() {
+    let (code, out, err) = cantap(&format!("{BOAT} --view signals --size 90x12"));
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert!(out.lines().count() == 12 && out.lines().all(|line| line.chars().count() <= 90), "{out}");
+    assert!(out.contains("PositionRapid.Latitude") && out.contains("deg"), "{out}");
+    // Where it cannot look at anything, it says so and fails.
+    for (line, code, part) in [
+        ("monitor nothing.log --once", 1, "nothing.log"),
+        ("monitor -d /dev/nothing -b 500k --once", 1, "there is no device at '/dev/nothing'"),
+        ("monitor --once --size 0x5", 2, "80x24"),
+        ("monitor --svg a.svg", 2, "--once"),
+        ("monitor --normal --mode listen --once", 2, "--mode"),
+        ("monitor a.log -d virtual", 2, "--device"),
+        ("monitor -d virtual -b 999999 --once", 1, "947368"),
+        ("monitor -d virtual -c 3 --once", 2, "a channel is 1, 2 or both"),
+    ] {
+        let (got, _, err) = cantap(line);
+        assert!(got == Some(code) && err.contains(part), "{line}: {got:?} {err}");
+    }
+}
+
+#[test]
+fn channels_are_opened_as_by_the_other_commands() {
+    for (line, parts) in [
+        ("-b 500k -b 2:250k", vec!["Channel 1: 500000 bit/s", "Channel 2: 250000 bit/s", "listen-only"]),
+        ("-b 2:250k", vec!["Channel 2: 250000 bit/s"]),
+        ("-c 1", vec!["Channel 1: 500000 bit/s"]),
+        ("--segments 9,13,2,2", vec!["Channel 1: 250000 bit/s", "Channel 2: 250000 bit/s"]),
+        ("-b 500k --sample-point 75 --mode normal", vec!["Channel 1: 500000 bit/s", " normal: running"]),
+        ("-b 500k --mode loopback", vec![" loopback: running"]),
+    ] {
+        let line =
+            format!("monitor -d virtual:load=30 --view statistics --once --size 120x40 -t 800ms {line}");
+        let (code, out, err) = cantap(&line);
+        assert_eq!((code, err.as_str()), (Some(0), ""), "{line}");
+        for part in parts {
+            assert!(out.contains(part), "{line}: {part}\n{out}");
+        }
+        let both = line.contains("-b 500k") || line.contains("--segments");
+        let heard = out.matches("\nChannel ").count();
+        assert_eq!(
+            heard,
+            if line.contains("loopback") {
+                0
+            } else if both {
+                2
+            } else {
+                1
+            },
+            "{line}\n{out}"
+        );
+    }
+}

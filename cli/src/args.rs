@@ -38,6 +38,12 @@ pub fn duration(text: &str) -> Result<Duration, String> {
         .ok_or_else(|| "write a time as a number and a unit, such as 400ms, 3s or 2m".to_owned())
 }
 
+/// As [`duration`], but longer than nothing.
+pub fn positive_duration(text: &str) -> Result<Duration, String> {
+    let duration = duration(text)?;
+    if duration.is_zero() { Err("give a time longer than zero".to_owned()) } else { Ok(duration) }
+}
+
 /// A share in per cent, 0 to 100.
 pub fn percent(text: &str) -> Result<f64, String> {
     let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();

@@ -22,7 +22,7 @@ pub struct LiveArgs {
     #[arg(short, long, requires = "device", value_parser = args::bitrate)]
     bitrate: Option<u32>,
     /// Listen only for so long, as 10, 500ms or 2m.
-    #[arg(short, long, requires = "device", value_parser = args::duration)]
+    #[arg(short, long, requires = "device", value_parser = args::positive_duration)]
     time: Option<Duration>,
 }
 

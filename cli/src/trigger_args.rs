@@ -15,7 +15,7 @@ pub struct TriggerArgs {
     /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123"
     /// or "error" (see cantap search --help).
     #[arg(long, value_name = "CONDITION")]
-    trigger: Option<String>,
+    pub trigger: Option<String>,
     /// Keep also what happened for so long before the condition held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     pre: Duration,

@@ -160,6 +160,29 @@ fn what_cannot_work_is_one_line_with_the_next_step() {
     }
     assert_eq!(cantap("capture -d virtual").0, Some(2));
     assert_eq!(cantap("demo --load 101").0, Some(2));
+    assert_eq!(cantap("capture -d virtual -b 1M -n 0").0, Some(2));
+    assert_eq!(cantap("capture -d virtual -b 1M -t 0").0, Some(2));
+}
+
+#[cfg(unix)]
+#[test]
+fn a_capture_that_outgrows_its_place_says_how_many_frames_the_file_has() {
+    let folder = tempfile::tempdir().unwrap();
+    // A file may have 64 KiB here.
+    let script = "trap '' XFSZ; ulimit -f 128; exec \"$0\" capture -d virtual:load=100 -b 1M -t 20 -o cut.log --json";
+    let output = Command::new("sh")
+        .args(["-c", script, env!("CARGO_BIN_EXE_cantap")])
+        .current_dir(folder.path())
+        .output()
+        .unwrap();
+    assert_eq!(output.status.code(), Some(1), "{output:?}");
+    let summary: serde_json::Value = serde_json::from_slice(&output.stdout).unwrap();
+    let text = std::fs::read_to_string(folder.path().join("cut.log")).unwrap();
+    assert!(text.ends_with('\n') && text.len() <= 128 * 512, "{}", text.len());
+    assert_eq!(summary["frames_in_file"], text.lines().count());
+    let captured = &summary["channels"];
+    let captured = captured[0]["frames"].as_u64().unwrap() + captured[1]["frames"].as_u64().unwrap();
+    assert!(captured > text.lines().count() as u64, "{summary}");
 }
 
 #[cfg(target_os = "linux")]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use anyhow::Context;
 use cantap::device::Records;
 use cantap::filter::Filter;
-use cantap::formats::{Format, TraceWriter, create_writer};
+use cantap::formats::{Format, ReadOptions, TraceWriter, create_writer, open_reader};
 use cantap::trigger::{Trigger, TriggerCounts};
 use cantap::wire::message::Mode;
 use cantap::{Address, Channel, Device, TraceRecord};
@@ -48,10 +48,10 @@ pub struct Args {
     #[arg(short, long)]
     output: Option<PathBuf>,
     /// End after so many frames.
-    #[arg(short = 'n', long, value_name = "N")]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// End after this time, as 10, 500ms or 2m.
-    #[arg(short, long, value_parser = args::duration)]
+    #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Print one JSON object with the summary.
     #[arg(long)]
@@ -85,6 +85,9 @@ struct Summary {
     clock_drift_ppm: Option<f64>,
     #[serde(skip_serializing_if = "Option::is_none")]
     trigger: Option<TriggerSummary>,
+    /// After a failure: how many of the frames the file has.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    frames_in_file: Option<u64>,
 }
 
 #[derive(serde::Serialize)]
@@ -143,12 +146,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     });
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
+    let failed = end.is_err() || finished.is_err();
     let summary = Summary {
         seconds: rounded(seconds, 3),
         channels: args.channel.iter().map(|channel| summarize(channel, &meters)).collect(),
         lost: Losses::of(&device.counters()),
         clock_drift_ppm: device.clock().drift_ppm.map(|ppm| rounded(ppm, 2)),
         trigger,
+        frames_in_file: if failed { frames_in_file(args) } else { None },
     };
     report(args, &summary)?;
     end?;
@@ -237,6 +242,21 @@ fn summarize(channel: Channel, meters: &[Meter; 2]) -> ChannelSummary {
     }
 }
 
+/// The format where the file's suffix does not say one.
+fn implied_format(path: &Path) -> Option<Format> {
+    path.extension().is_none().then_some(Format::Candump)
+}
+
+/// How many frames are in the one regular file that was written, by reading it again; `None` if there is no such file, or
+/// not every frame was meant for it.
+fn frames_in_file(args: &Args) -> Option<u64> {
+    let is_one = args.write.rotate.is_empty() && args.trigger.trigger.is_none();
+    let path = args.output.as_deref().filter(|path| is_one && path.is_file())?;
+    let options = ReadOptions { format: implied_format(path), ..ReadOptions::default() };
+    let records = open_reader(path, &options).ok()?.filter_map(Result::ok);
+    Some(records.filter(|record| record.frame().is_some()).count() as u64)
+}
+
 fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
     if args.json {
         writeln!(io::stdout().lock(), "{}", serde_json::to_string(summary)?)?;
@@ -254,6 +274,12 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
         if *forgotten > 0 {
             eprintln!("{forgotten} records before events were too many to remember; use a shorter --pre");
         }
+    }
+    let frames: u64 = summary.channels.iter().map(|channel| channel.frames).sum();
+    if let (Some(path), Some(in_file)) =
+        (&args.output, summary.frames_in_file.filter(|in_file| *in_file != frames))
+    {
+        eprintln!("{in_file} of the {frames} frames are in '{}'", path.display());
     }
     eprintln!("lost: {}", summary.lost.line());
     if let Some(ppm) = summary.clock_drift_ppm {
@@ -281,8 +307,7 @@ impl Sink {
             }
             None => Path::new("-"),
         };
-        let format = path.extension().is_none().then_some(Format::Candump);
-        let options = args.write.options(format)?;
+        let options = args.write.options(implied_format(path))?;
         let name = path.display().to_string();
         let writer = create_writer(path, &options).with_context(|| {
             format!("cannot write to '{name}'; choose a folder and name that you may write")

@@ -72,7 +72,7 @@ pub struct Args {
 pub struct WriteArgs {
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
     #[arg(long, value_name = "SIZE|TIME")]
-    rotate: Vec<RotateAt>,
+    pub rotate: Vec<RotateAt>,
     /// Keep only so many of these files: the oldest are deleted.
     #[arg(long, value_name = "N", requires = "rotate", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,

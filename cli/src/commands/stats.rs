@@ -40,7 +40,7 @@ pub struct Args {
     #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
     channel: args::Channels,
     /// Listen only for so long.
-    #[arg(short = 't', long, value_name = "TIME", requires = "device", value_parser = args::duration)]
+    #[arg(short = 't', long, value_name = "TIME", requires = "device", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]

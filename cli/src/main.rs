@@ -46,10 +46,18 @@ fn main() -> ExitCode {
         // `cantap … | head` has read what it wanted.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cantap: {error:#}");
+            eprintln!("cantap: {}", sentence(&error));
             ExitCode::from(exit::FAILURE)
         }
     }
+}
+
+/// The error and its causes, but for causes that the error itself tells already, as the library's do.
+fn sentence(error: &anyhow::Error) -> String {
+    error.chain().skip(1).fold(error.to_string(), |text, cause| {
+        let cause = cause.to_string();
+        if text.contains(&cause) { text } else { format!("{text}: {cause}") }
+    })
 }
 
 /// Whether it only says that nobody reads our output any more.

@@ -169,7 +169,8 @@ fn what_cannot_work_is_one_line_with_the_next_step() {
 fn a_capture_that_outgrows_its_place_says_how_many_frames_the_file_has() {
     let folder = tempfile::tempdir().unwrap();
     // A file may have 64 KiB here.
-    let script = "trap '' XFSZ; ulimit -f 128; exec \"$0\" capture -d virtual:load=100 -b 1M -t 20 -o cut.log --json";
+    let script =
+        "trap '' XFSZ; ulimit -f 128; exec \"$0\" capture -d virtual:load=100 -b 1M -t 20 -o cut.log --json";
     let output = Command::new("sh")
         .args(["-c", script, env!("CARGO_BIN_EXE_cantap")])
         .current_dir(folder.path())

@@ -127,9 +127,8 @@ impl Condition {
             Expression::Number(value) => Some(*value),
             Expression::Part(part) => part_of(*part, record),
             Expression::Byte(index) => {
-                let index = self.evaluate(index, record)?;
-                // A negative or fractional index rounds towards a byte as a cast does.
-                record.frame()?.data().get(index as usize).copied().map(f64::from)
+                let index = byte_index(self.evaluate(index, record)?)?;
+                record.frame()?.data().get(index).copied().map(f64::from)
             }
             Expression::Signal(slot) => self.slots[*slot].last.map(|(_, _, value)| value),
             Expression::HasText(slot, raws) => {
@@ -160,6 +159,22 @@ impl Condition {
     }
 }
 
+/// The value of what depends on no record.
+fn constant(expression: &Expression) -> Option<f64> {
+    match expression {
+        Expression::Number(value) => Some(*value),
+        Expression::Negative(inner) => constant(inner).map(|value| -value),
+        Expression::Binary(operator, left, right) => binary(*operator, constant(left)?, constant(right)?),
+        _ => None,
+    }
+}
+
+/// The place of a data byte, if there can be a byte at it.
+fn byte_index(value: f64) -> Option<usize> {
+    const MOST: f64 = 7.0;
+    (value.fract() == 0.0 && (0.0..=MOST).contains(&value)).then_some(value as usize)
+}
+
 /// Not-a-number is as unknown as nothing at all.
 fn truth(value: Option<f64>) -> Option<bool> {
     value.filter(|value| !value.is_nan()).map(|value| value != 0.0)
@@ -186,7 +201,7 @@ fn binary(operator: Operator, left: f64, right: f64) -> Option<f64> {
         Operator::Add => Some(left + right),
         Operator::Subtract => Some(left - right),
         Operator::Multiply => Some(left * right),
-        // By zero: infinite or not a number, as floats do.
+        Operator::Divide | Operator::Remainder if right == 0.0 => None,
         Operator::Divide => Some(left / right),
         Operator::Remainder => Some(left % right),
     }
@@ -227,7 +242,11 @@ impl Binder<'_> {
             Kind::Name(name) => self.name(node.at, name)?,
             Kind::Byte(index) => {
                 self.about_frames = true;
-                Expression::Byte(self.bind(index)?.into())
+                let bound = self.bind(index)?;
+                if let Some(value) = constant(&bound).filter(|value| byte_index(*value).is_none()) {
+                    return Err((index.at, ConditionFault::ByteIndex(value.to_string())));
+                }
+                Expression::Byte(bound.into())
             }
             Kind::Not(inner) => Expression::Not(self.bind(inner)?.into()),
             Kind::Negative(inner) => Expression::Negative(self.bind(inner)?.into()),
@@ -364,7 +383,11 @@ mod tests {
         assert_eq!(hits("len == 0 or byte[0] / 2 > 0x30", FRAMES), [2, 6]);
         assert_eq!(hits("ext or rtr", &["00000001#", "001#R", "001#"]), [0, 1]);
         assert_eq!(hits("dlc == 9", &["001#1122334455667788_9"]), [0]);
-        assert_eq!(hits("byte[-1] == 1 or byte[1e30] == 1", &["001#02"]), [] as [usize; 0]);
+        assert_eq!(hits("byte[0 - len] == 1 or byte[len / 2] == 1", &["001#01"]), [] as [usize; 0]);
+        assert_eq!(
+            hits("byte[0] / (len - 1) > 1 or byte[0] % (len - 1) >= 0", &["001#02"]),
+            [] as [usize; 0]
+        );
     }
 
     #[test]
@@ -380,7 +403,7 @@ mod tests {
         let nan = &["001#000000000000C07F"];
         assert_eq!(hits("F == F or F != F or not F or F", nan), [] as [usize; 0]);
         assert_eq!(hits("F > 1 or Speed == 0", nan), [0]);
-        assert_eq!(hits("Speed / 0 > 1", &["001#01"]), [0]);
+        assert_eq!(hits("Speed / 0 > 1 or Speed % 0 == 0", &["001#01"]), [] as [usize; 0]);
     }
 
     #[test]
@@ -392,6 +415,12 @@ mod tests {
                 "Gear has no value \"Driv\"; it has Not available, Drive\n  Gear == Driv\n          ^",
             ),
             ("Engine.Speed == Fast", "Engine.Speed has no value \"Fast\"\n"),
+            (
+                "byte[-1] == 1",
+                "a frame has no byte -1; bytes are counted from 0 to 7\n  byte[-1] == 1\n       ^",
+            ),
+            ("byte[1 + 0.5] == 1", "a frame has no byte 1.5; "),
+            ("byte[8] == 1", "a frame has no byte 8; "),
             ("'Drive' > 1", "a text can only be compared with a signal, by == or !=\n  'Drive' > 1\n  ^"),
         ] {
             let error = Condition::new(text, &decoder()).unwrap_err().to_string();

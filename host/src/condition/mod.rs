@@ -12,7 +12,7 @@
 //! | `+ - * / % & \|`, `== != < <= > >=`, `not and or`, `( )` | as usual; `&` and `\|` bind tighter than comparisons |
 //!
 //! What is not known makes a comparison neither true nor false: a signal before its first frame, a
-//! byte beyond the data. A condition about signals alone is looked at when one of them arrives.
+//! byte beyond the data, a division by zero. A condition about signals alone is looked at when one of them arrives.
 
 mod bind;
 mod error;

@@ -148,6 +148,7 @@ fn number(rest: &str) -> Result<(Token, usize), ConditionFault> {
         )
     };
     let value = radix("0x", 16).or_else(|| radix("0b", 2)).unwrap_or_else(|| digits.parse().ok());
+    let value = value.filter(|value: &f64| value.is_finite());
     match value {
         Some(value) => Ok((Token::Number(value), end)),
         None => Err(ConditionFault::Number(rest[..end].to_owned())),
@@ -346,6 +347,7 @@ mod tests {
             ("1 < a < 3", 6, "comparisons cannot be chained; write \"a < b and b < c\""),
             ("a == 'x", 5, "this text has no closing quote"),
             ("a == 0xZZ", 5, "\"0xZZ\" is no number"),
+            ("a == 1e999", 5, "\"1e999\" is no number"),
             ("a # b", 2, "'#' has no meaning here"),
             ("", 0, "expected a number, a signal, a part of the frame or \"(\", found the end"),
         ] {

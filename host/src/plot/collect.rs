@@ -63,10 +63,11 @@ impl Gaps {
                 true
             }
             TraceEvent::Frame { .. } => {
-                let from = channel.last_frame.replace(x).unwrap_or(x);
+                let before = channel.last_frame.replace(x).unwrap_or(x);
                 let frames = std::mem::take(&mut channel.lost);
                 if frames > 0 {
-                    self.add(Gap { from, to: x, frames });
+                    // A trace's clock may be set back.
+                    self.add(Gap { from: before.min(x), to: before.max(x), frames });
                 }
                 false
             }
@@ -490,6 +491,19 @@ mod tests {
         let points = plot.panes[0].content.curves()[0].series.points();
         assert!(points.iter().all(|point| (point.y - 50.0).abs() < 6.0), "{points:?}");
         assert!(matches!(plot.panes[0].range, Some((0.0, 50.0 | 100.0))));
+    }
+
+    #[test]
+    fn a_gap_at_which_the_clock_is_set_back_is_drawn_forwards() {
+        let options = Options { bitrate_bps: Some(500_000), ..Options::default() };
+        let mut collector = LoadCollector::new(options).unwrap();
+        for record in [frame(1000, "123#"), frame(2000, "123#"), lost(1500, 9), frame(1600, "123#")] {
+            collector.push(&record);
+        }
+        let plot = collector.finish(String::new());
+        assert!(plot.gaps.iter().all(|gap| gap.from < gap.to), "{:?}", plot.gaps);
+        let text = plot.to_text(&crate::plot::TextStyle::default());
+        assert!(text.contains("load"), "{text}");
     }
 
     #[test]

@@ -2,16 +2,18 @@
 
 mod live;
 mod table;
+mod windows;
 
-use std::io::Write;
+use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use cantap::Address;
 use cantap::stats::{Options, PeakSummary, Statistics, Summary};
 
+use self::windows::Windows;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::input::ReadArgs;
@@ -67,15 +69,14 @@ impl Args {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut statistics = Statistics::new(args.options())?;
-    let mut windows = Vec::new();
+    let mut windows = args.windows.then(Windows::new).transpose()?;
     if let Some(address) = &args.device {
         live::run(args, address, &mut statistics, &mut windows)?;
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
-        let keep = args.windows;
         let mut closed = |window: &_| {
-            if keep {
-                windows.push(PeakSummary::of(window));
+            if let Some(windows) = &mut windows {
+                windows.push(window);
             }
         };
         let mut batch = Vec::new();
@@ -89,23 +90,38 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bail!("name a file, or a device with -d");
     }
     let summary = statistics.summary();
+    // Its reader may have gone; that is an error as any other.
+    let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
-        print_json(&summary, args.windows.then_some(&windows))?;
+        write_json(&summary, windows, &mut out)?;
     } else {
-        print(&table::text(&summary, &windows, args.per_id))?;
+        out.write_all(table::text(&summary, args.per_id).as_bytes())?;
+        if let Some(windows) = windows {
+            write_windows(&summary, windows, &mut out)?;
+        }
+        out.write_all(table::hint(&summary, args.per_id).as_bytes())?;
     }
+    out.flush()?;
     Ok(ExitCode::SUCCESS)
 }
 
-fn print_json(summary: &Summary, windows: Option<&Vec<PeakSummary>>) -> anyhow::Result<()> {
-    let mut object = serde_json::to_value(summary)?;
-    if let Some(windows) = windows {
-        object["windows"] = serde_json::to_value(windows)?;
-    }
-    print(&format!("{object}\n"))
+/// One object; the windows are its last member and go through memory one by one.
+fn write_json(summary: &Summary, windows: Option<Windows>, out: &mut impl Write) -> anyhow::Result<()> {
+    let object = serde_json::to_string(summary)?;
+    let Some(windows) = windows else { return Ok(writeln!(out, "{object}")?) };
+    let members = object.strip_suffix('}').context("a summary is an object")?;
+    write!(out, "{members},\"windows\":[")?;
+    let mut comma = "";
+    windows.for_each(|window| Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?))?;
+    Ok(writeln!(out, "]}}")?)
 }
 
-/// To standard output, whose reader may have gone.
-fn print(text: &str) -> anyhow::Result<()> {
-    Ok(std::io::stdout().lock().write_all(text.as_bytes())?)
+fn write_windows(summary: &Summary, windows: Windows, out: &mut impl Write) -> anyhow::Result<()> {
+    let zero_s = summary.channels.first().and_then(|channel| channel.first_s).unwrap_or(0.0);
+    let mut head = "\nWindows\n";
+    windows.for_each(|window| {
+        let window: PeakSummary = serde_json::from_str(window)?;
+        let line = table::window_line(&window, zero_s);
+        Ok(writeln!(out, "{}{line}", std::mem::take(&mut head))?)
+    })
 }

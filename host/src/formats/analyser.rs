@@ -177,8 +177,8 @@ impl RowEncoder {
     }
 
     /// The last row.
-    pub(crate) fn finish(&mut self) -> Option<TableRow> {
-        self.held.take()
+    pub(crate) fn last(&self) -> Option<&TableRow> {
+        self.held.as_ref()
     }
 
     /// Rows so far.
@@ -294,8 +294,12 @@ impl Encode for CsvEncoder {
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         self.start(0, out);
-        if let Some(row) = self.rows.finish() {
-            self.row(&row, out);
+        self.provisional_end(out);
+    }
+
+    fn provisional_end(&self, out: &mut Vec<u8>) {
+        if let Some(row) = self.rows.last() {
+            self.row(row, out);
         }
     }
 }

@@ -114,8 +114,15 @@ impl Encode for Encoder {
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         self.start(0, out);
-        if let Some(row) = self.rows.finish() {
-            self.row(&row, out);
+        self.provisional_end(out);
+    }
+
+    fn provisional_end(&self, out: &mut Vec<u8>) {
+        if !self.started {
+            return;
+        }
+        if let Some(row) = self.rows.last() {
+            self.row(row, out);
         }
         for line in [&b"-1,0"[..], b"EOD"] {
             out.extend_from_slice(line);

@@ -11,6 +11,7 @@ mod asc;
 mod blf;
 mod calendar;
 mod candump;
+mod compressed;
 mod csv;
 mod dif;
 mod event_text;

@@ -4,19 +4,19 @@ use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::Path;
 
-/// Compression that leaves a slow machine time to capture: level 1 of 9.
-const GZIP_LEVEL: u32 = 1;
-/// zstd's own default.
-const ZSTD_LEVEL: i32 = 3;
+use super::compressed::{Compressed, Compression};
 
 /// A destination of bytes.
 pub(crate) enum Output {
     /// A plain file: can be patched, and is cut back to whole records when the disk is full.
-    File { file: File, written: u64 },
-    /// gzip.
-    Gzip(flate2::write::GzEncoder<File>),
-    /// zstd.
-    Zstd(zstd::stream::write::Encoder<'static, File>),
+    File {
+        file: File,
+        written: u64,
+        /// How long the file is with its provisional end.
+        extent: u64,
+    },
+    /// A compressed file.
+    Compressed(Box<Compressed>),
     /// Standard output and whatever else only takes bytes.
     Stream(Box<dyn Write + Send>),
 }
@@ -29,25 +29,6 @@ pub(crate) struct Patch {
     pub bytes: Vec<u8>,
 }
 
-/// How a path's last suffix says to compress.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Compression {
-    None,
-    Gzip,
-    Zstd,
-}
-
-impl Compression {
-    /// By suffix: `.gz`, `.zst`.
-    pub(crate) fn of(path: &Path) -> Self {
-        match path.extension().and_then(|suffix| suffix.to_str()) {
-            Some(suffix) if suffix.eq_ignore_ascii_case("gz") => Self::Gzip,
-            Some(suffix) if suffix.eq_ignore_ascii_case("zst") => Self::Zstd,
-            _ => Self::None,
-        }
-    }
-}
-
 impl Output {
     /// Creates a file, or uses standard output for `-`.
     pub(crate) fn create(path: &Path) -> io::Result<Self> {
@@ -56,24 +37,20 @@ impl Output {
         }
         let file = File::create(path)?;
         Ok(match Compression::of(path) {
-            Compression::Gzip => {
-                Self::Gzip(flate2::write::GzEncoder::new(file, flate2::Compression::new(GZIP_LEVEL)))
-            }
-            Compression::Zstd => Self::Zstd(zstd::stream::write::Encoder::new(file, ZSTD_LEVEL)?),
             // A pipe or device has no place to go back to.
             Compression::None if !file.metadata()?.is_file() => Self::Stream(Box::new(file)),
-            Compression::None => Self::File { file, written: 0 },
+            Compression::None => Self::File { file, written: 0, extent: 0 },
+            compression => Self::Compressed(Box::new(Compressed::new(file, compression)?)),
         })
     }
 
     /// Writes whole records. If that fails half-way, a plain file is cut back to the last record
     /// that is complete, as `whole` tells from the bytes that went out.
     pub(crate) fn write(&mut self, bytes: &[u8], whole: impl Fn(&[u8]) -> usize) -> io::Result<()> {
-        let (file, written) = match self {
-            Self::Gzip(encoder) => return encoder.write_all(bytes),
-            Self::Zstd(encoder) => return encoder.write_all(bytes),
+        let (file, written, extent) = match self {
+            Self::Compressed(compressed) => return compressed.write(bytes),
             Self::Stream(stream) => return stream.write_all(bytes),
-            Self::File { file, written } => (file, written),
+            Self::File { file, written, extent } => (file, written, extent),
         };
         let mut done = 0;
         while done < bytes.len() {
@@ -94,24 +71,44 @@ impl Output {
             return Err(error);
         }
         *written += done as u64;
+        // What is left of a provisional end that was longer.
+        if *extent > *written {
+            file.set_len(*written)?;
+        }
+        *extent = *written;
         Ok(())
     }
 
-    /// How large the file is by now; `None` for what is no file. What a compressor still holds is not in
-    /// it.
-    pub(crate) fn size(&self) -> Option<u64> {
-        let file = match self {
-            Self::File { written, .. } => return Some(*written),
-            Self::Gzip(encoder) => encoder.get_ref(),
-            Self::Zstd(encoder) => encoder.get_ref(),
-            Self::Stream(_) => return None,
-        };
-        file.metadata().ok().map(|metadata| metadata.len())
+    /// Writes a provisional end, so that the file is whole if nothing more comes: what does come is written over it.
+    /// Where that cannot be done, nothing is written.
+    pub(crate) fn provisional_end(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let Self::File { file, written, extent } = self else { return Ok(()) };
+        if bytes.is_empty() {
+            return Ok(());
+        }
+        *extent = *written + bytes.len() as u64;
+        let result = file.write_all(bytes);
+        if result.is_err() {
+            // The first error is the one to report; this is only tidying up after it.
+            let _ = file.set_len(*written);
+        }
+        file.seek(SeekFrom::Start(*written))?;
+        result
+    }
+
+    /// How large the file is by now, with what is to be written next; `None` for what is no file. What a compressor still
+    /// holds is not in it.
+    pub(crate) fn size(&mut self) -> Option<u64> {
+        match self {
+            Self::File { written, .. } => Some(*written),
+            Self::Compressed(compressed) => Some(compressed.size()),
+            Self::Stream(_) => None,
+        }
     }
 
     /// Changes bytes already written. False where that cannot be done.
     pub(crate) fn patch(&mut self, patch: &Patch) -> io::Result<bool> {
-        let Self::File { file, written } = self else { return Ok(false) };
+        let Self::File { file, written, .. } = self else { return Ok(false) };
         file.seek(SeekFrom::Start(patch.offset))?;
         file.write_all(&patch.bytes)?;
         file.seek(SeekFrom::Start(*written))?;
@@ -122,8 +119,7 @@ impl Output {
     pub(crate) fn flush(&mut self) -> io::Result<()> {
         match self {
             Self::File { file, .. } => file.flush(),
-            Self::Gzip(encoder) => encoder.flush(),
-            Self::Zstd(encoder) => encoder.flush(),
+            Self::Compressed(compressed) => compressed.flush(),
             Self::Stream(stream) => stream.flush(),
         }
     }
@@ -132,8 +128,7 @@ impl Output {
     pub(crate) fn finish(self) -> io::Result<()> {
         match self {
             Self::File { mut file, .. } => file.flush(),
-            Self::Gzip(encoder) => encoder.finish()?.flush(),
-            Self::Zstd(encoder) => encoder.finish()?.flush(),
+            Self::Compressed(compressed) => compressed.finish(),
             Self::Stream(mut stream) => stream.flush(),
         }
     }

@@ -64,8 +64,9 @@ pub struct Rotation {
     pub keep: Option<usize>,
 }
 
-/// Room left below the size limit: one record in the most verbose format, and the end of the file.
-const RESERVE_BYTES: u64 = 256;
+/// Room left below the size limit: two records in the most verbose format (DIF, one of them held back), and the end of
+/// the file.
+const RESERVE_BYTES: u64 = 1024;
 
 /// Digits of the number in a file's name. More files than that get longer names.
 const NUMBER_DIGITS: usize = 6;

@@ -92,6 +92,10 @@ pub(crate) trait Encode: Send {
     /// Appends the file's end. A file without any record gets its head here.
     fn finish(&mut self, out: &mut Vec<u8>, left_out: &mut LeftOut);
 
+    /// Appends what would make a file end here: what [`Self::finish`] would append, and what is held back for a record that
+    /// may come.
+    fn provisional_end(&self, _out: &mut Vec<u8>) {}
+
     /// What to change in the bytes already written, after `written` bytes in all.
     fn patch(&self, _written: u64) -> Option<Patch> {
         None
@@ -176,12 +180,18 @@ impl FileWriter {
         self.has_records
     }
 
+    /// Hands the buffer on, and makes the file one that may end there.
     fn drain(&mut self) -> io::Result<()> {
         let encoder = &self.encoder;
         let result = self.output.write(&self.buffer, |bytes| encoder.whole(bytes));
         self.written += self.buffer.len() as u64;
         self.buffer.clear();
         self.size = self.output.size().unwrap_or(self.written);
+        result?;
+        self.patch()?;
+        self.encoder.provisional_end(&mut self.buffer);
+        let result = self.output.provisional_end(&self.buffer);
+        self.buffer.clear();
         result
     }
 
@@ -207,13 +217,14 @@ impl TraceWriter for FileWriter {
     fn flush(&mut self) -> io::Result<()> {
         self.encoder.flush(&mut self.buffer, &mut self.left_out);
         self.drain()?;
-        self.patch()?;
         self.output.flush()
     }
 
     fn finish(mut self: Box<Self>) -> io::Result<LeftOut> {
         self.encoder.finish(&mut self.buffer, &mut self.left_out);
-        self.drain()?;
+        let result = self.output.write(&self.buffer, |bytes| self.encoder.whole(bytes));
+        self.written += self.buffer.len() as u64;
+        result?;
         self.patch()?;
         self.output.finish()?;
         Ok(self.left_out)

@@ -1,7 +1,7 @@
 //! Statistics as plain values: what `cantap stats --json` prints.
 
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::{ChannelStatistics, IdStatistics, Statistics, Window};
 
@@ -99,7 +99,7 @@ pub struct LoadSummary {
 }
 
 /// A window of time, as it is printed.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct PeakSummary {
     /// The channel, from 1.
     pub channel: u8,

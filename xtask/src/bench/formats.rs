@@ -1,13 +1,12 @@
 //! Converting and reading trace files, side by side with can-utils' log2asc and python-can: the same million frames of
-//! a ship's bus, from file to file, in one run.
+//! a ship's bus, from file to file, in one run. Conversions are those of the command, from its start to its end.
 
-use std::fs::{self, File};
-use std::io::Read;
+use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
-use cantap::formats::{Format, ReadOptions, TraceReader, WriteOptions, create_writer, open_reader};
+use cantap::formats::{ReadOptions, WriteOptions, create_writer, open_reader};
 use xshell::{Shell, cmd};
 
 use crate::peers::Peers;
@@ -19,10 +18,6 @@ const RECORDING: &str = "host/tests/data/nmea2000.log.gz";
 const FRAMES: u64 = 1_000_000;
 /// Ours and log2asc take turns so often, and the best of each counts. python-can takes longer than the machine's moods.
 const ROUNDS: usize = 5;
-/// How often the trace is joined to itself where only memory counts.
-const REPEATS: u64 = 5;
-/// What the project promises of a conversion of any length.
-const MOST_MEMORY_BYTES: u64 = 64 * 1024 * 1024;
 
 /// The files, kept in `target/` for whoever wants to look at them.
 struct Files {
@@ -31,7 +26,6 @@ struct Files {
     blf: PathBuf,
     peer_asc: PathBuf,
     peer_blf: PathBuf,
-    long_blf: PathBuf,
 }
 
 impl Files {
@@ -44,16 +38,16 @@ impl Files {
             blf: dir.join("cantap.blf"),
             peer_asc: dir.join("log2asc.asc"),
             peer_blf: dir.join("python-can.blf"),
-            long_blf: dir.join("long.blf"),
         })
     }
 }
 
-/// Measures speed, then memory.
+/// Measures speed.
 pub fn run() -> Result<()> {
     let shell = workspace::shell()?;
     let files = Files::create()?;
-    make_trace(&files.log)?;
+    cmd!(shell, "cargo build --release --quiet -p cantap-cli").quiet().run()?;
+    make_trace(&files.log, FRAMES)?;
     let bytes = fs::metadata(&files.log)?.len();
     println!(
         "formats: {FRAMES} frames of {RECORDING} repeated, a candump log of {bytes} bytes, one conversion at a time"
@@ -62,25 +56,24 @@ pub fn run() -> Result<()> {
         compare(&shell, &peers, &files)?
     } else {
         println!("{:<16} {:>10}", "", "cantap, s");
-        println!("{:<16} {:>10.3}", "candump to ASC", best(|| convert(&files.log, &files.asc))?);
-        println!("{:<16} {:>10.3}", "candump to BLF", best(|| convert(&files.log, &files.blf))?);
+        println!("{:<16} {:>10.3}", "candump to ASC", best(|| convert(&shell, &files.log, &files.asc))?);
+        println!("{:<16} {:>10.3}", "candump to BLF", best(|| convert(&shell, &files.log, &files.blf))?);
         println!("{:<16} {:>10.3}", "read BLF", best(|| count(&files.blf))?);
         Vec::new()
     };
-    memory(&files)?;
     ensure!(slow.is_empty(), "not fast enough: {}", slow.join(", "));
     Ok(())
 }
 
-/// The recording over and over, with times that go on.
-fn make_trace(log: &Path) -> Result<()> {
+/// The recording over and over, with times that go on, up to so many frames.
+pub(super) fn make_trace(log: &Path, frames: u64) -> Result<()> {
     let records: Vec<_> =
         open_reader(workspace::root().join(RECORDING), &ReadOptions::default())?.collect::<Result<_, _>>()?;
     let (first, last) = records.first().zip(records.last()).context("the recording is empty")?;
     let span_ns = last.time_ns - first.time_ns + 1_000_000;
     let mut writer = create_writer(log, &WriteOptions::default())?;
     let laps = (0..).flat_map(|lap| records.iter().map(move |record| (lap, *record)));
-    for (lap, mut record) in laps.take(FRAMES as usize) {
+    for (lap, mut record) in laps.take(frames as usize) {
         record.time_ns += lap * span_ns;
         writer.write(&record)?;
     }
@@ -106,7 +99,7 @@ fn compare(shell: &Shell, peers: &Peers, files: &Files) -> Result<Vec<&'static s
     let (mut ours, mut theirs) = (f64::MAX, f64::MAX);
     let (log, peer_asc) = (&files.log, &files.peer_asc);
     for _ in 0..ROUNDS {
-        ours = ours.min(timed(|| convert(log, &files.asc))?);
+        ours = ours.min(timed(|| convert(shell, log, &files.asc))?);
         let log2asc =
             || Ok(cmd!(shell, "log2asc -I {log} -O {peer_asc} can0").quiet().run().map(|()| FRAMES)?);
         theirs = theirs.min(timed(log2asc)?);
@@ -114,12 +107,17 @@ fn compare(shell: &Shell, peers: &Peers, files: &Files) -> Result<Vec<&'static s
     line("candump to ASC", ours, "log2asc", theirs, 8.0);
 
     let theirs = python_can(shell, peers, &[log, &files.peer_blf])?;
-    line("candump to BLF", best(|| convert(log, &files.blf))?, "python-can", theirs, 30.0);
+    line("candump to BLF", best(|| convert(shell, log, &files.blf))?, "python-can", theirs, 30.0);
 
     let theirs = python_can(shell, peers, &[&files.blf])?;
     line("read BLF", best(|| count(&files.blf))?, "python-can", theirs, 20.0);
 
-    for (program, file) in [("log2asc", peer_asc), ("python-can", &files.peer_blf), ("cantap", &files.asc)] {
+    for (program, file) in [
+        ("log2asc", peer_asc),
+        ("python-can", &files.peer_blf),
+        ("cantap", &files.asc),
+        ("cantap", &files.blf),
+    ] {
         let found = count(file)?;
         ensure!(found == FRAMES, "{program} wrote {found} of {FRAMES} frames into {}", file.display());
     }
@@ -136,70 +134,11 @@ fn python_can(shell: &Shell, peers: &Peers, files: &[&Path]) -> Result<f64> {
     Ok(seconds.parse()?)
 }
 
-/// The most memory that this program occupies while it converts traces of one length and of several times
-/// that.
-fn memory(files: &Files) -> Result<()> {
-    if !reset_peak_memory() {
-        println!("memory is not measured: this system has no /proc/self/clear_refs");
-        return Ok(());
-    }
-    let mut most_bytes = 0;
-    let mut line = |what: &str, repeats: u64| -> Result<()> {
-        let bytes = peak_memory_bytes()?;
-        reset_peak_memory();
-        println!(
-            "{what:<16} {:>10} frames: at most {:>5.1} MiB",
-            FRAMES * repeats,
-            bytes as f64 / 1_048_576.0
-        );
-        most_bytes = bytes.max(most_bytes);
-        Ok(())
-    };
-    for repeats in [1, REPEATS] {
-        let mut log: Box<dyn Read + Send> = Box::new(std::io::empty());
-        for _ in 0..repeats {
-            log = Box::new(log.chain(File::open(&files.log)?));
-        }
-        let reader = TraceReader::from_source("the trace", log, Format::Candump, &ReadOptions::default())?;
-        copy(reader, &files.long_blf)?;
-        line("candump to BLF", repeats)?;
-        let found = convert(&files.long_blf, &files.asc)?;
-        ensure!(found == repeats * FRAMES, "a long trace has {found} frames");
-        line("BLF to ASC", repeats)?;
-    }
-    fs::remove_file(&files.long_blf)?;
-    ensure!(most_bytes < MOST_MEMORY_BYTES, "a conversion takes {most_bytes} bytes of memory");
-    Ok(())
-}
-
-/// Begins the measurement of the peak anew, where the system can.
-fn reset_peak_memory() -> bool {
-    fs::write("/proc/self/clear_refs", "5").is_ok()
-}
-
-/// The most memory this process had resident since the last reset.
-fn peak_memory_bytes() -> Result<u64> {
-    let status = fs::read_to_string("/proc/self/status")?;
-    let line = status.lines().find_map(|line| line.strip_prefix("VmHWM:"));
-    let kilobytes =
-        line.and_then(|line| line.trim().strip_suffix(" kB")).context("no VmHWM in the status")?;
-    Ok(kilobytes.parse::<u64>()? * 1024)
-}
-
-/// From one file to another, as `cantap convert` does it; how many frames.
-fn convert(from: &Path, to: &Path) -> Result<u64> {
-    copy(open_reader(from, &ReadOptions::default())?, to)
-}
-
-fn copy(reader: TraceReader, to: &Path) -> Result<u64> {
-    let mut writer = create_writer(to, &WriteOptions::default())?;
-    let mut frames = 0;
-    for record in reader {
-        writer.write(&record?)?;
-        frames += 1;
-    }
-    writer.finish()?;
-    Ok(frames)
+/// From one file to another by the command.
+fn convert(shell: &Shell, from: &Path, to: &Path) -> Result<u64> {
+    let program = workspace::target().join("release/cantap");
+    cmd!(shell, "{program} convert {from} {to}").quiet().run()?;
+    Ok(FRAMES)
 }
 
 /// How many frames a file has.

@@ -12,6 +12,8 @@ mod formats;
 #[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
+mod memory;
+#[cfg(feature = "bench")]
 mod monitor;
 #[cfg(feature = "bench")]
 mod signals;
@@ -31,6 +33,8 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
+    /// What the command occupies with long traces, in every format.
+    Memory,
     /// Decoding signals, against cantools.
     Signals,
     /// What the firmware's ELF costs and bears on the emulated board.
@@ -83,6 +87,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
+            Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
             Subject::Bus => bus::run()?,

@@ -6,10 +6,11 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, bail};
 use cantap::device::Records;
-use cantap::stats::{PeakSummary, Statistics, Window};
+use cantap::stats::{Statistics, Window};
 use cantap::{Address, Device, TraceRecord};
 
 use super::Args;
+use super::windows::Windows;
 use crate::interrupt;
 
 /// How long to wait for records before looking at clock and Ctrl-C.
@@ -24,7 +25,7 @@ pub(super) fn run(
     args: &Args,
     address: &Address,
     statistics: &mut Statistics,
-    windows: &mut Vec<PeakSummary>,
+    windows: &mut Option<Windows>,
 ) -> anyhow::Result<()> {
     interrupt::watch()?;
     let device = Device::open(address)?;
@@ -39,8 +40,8 @@ pub(super) fn run(
     let mut show = Lines::new(!args.json);
     let mut keep = |window: &Window| {
         show.window(window);
-        if args.windows {
-            windows.push(PeakSummary::of(window));
+        if let Some(windows) = windows {
+            windows.push(window);
         }
     };
     let start = Instant::now();

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use cantap::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
 /// Everything, for a terminal of any width above eighty columns.
-pub(super) fn text(summary: &Summary, windows: &[PeakSummary], per_id: bool) -> String {
+pub(super) fn text(summary: &Summary, per_id: bool) -> String {
     let mut out = String::new();
     // Writing to a String cannot fail.
     let _ = writeln!(
@@ -24,14 +24,13 @@ pub(super) fn text(summary: &Summary, windows: &[PeakSummary], per_id: bool) -> 
             ids_text(&channel.ids, &mut out);
         }
     }
-    if !windows.is_empty() {
-        out.push_str("\nWindows\n");
-        window_lines(windows, summary.channels.first(), &mut out);
-    }
-    if !per_id && summary.channels.iter().any(|channel| !channel.ids.is_empty()) {
-        out.push_str("\nperiods and jitter of each identifier: --per-id\n");
-    }
     out
+}
+
+/// What else there would be to see, behind everything else.
+pub(super) fn hint(summary: &Summary, per_id: bool) -> &'static str {
+    let has_ids = summary.channels.iter().any(|channel| !channel.ids.is_empty());
+    if has_ids && !per_id { "\nperiods and jitter of each identifier: --per-id\n" } else { "" }
 }
 
 fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
@@ -119,7 +118,10 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     }
     if !channel.peaks.is_empty() {
         out.push_str("  busiest windows\n");
-        window_lines(&channel.peaks, Some(channel), out);
+        let zero_s = channel.first_s.unwrap_or(0.0);
+        for window in &channel.peaks {
+            let _ = writeln!(out, "{}", window_line(window, zero_s));
+        }
     }
 }
 
@@ -133,30 +135,26 @@ fn listed(counts: &[(u64, &str)]) -> String {
     some.join(", ")
 }
 
-/// Windows with their start relative to the trace's.
-fn window_lines(windows: &[PeakSummary], reference: Option<&ChannelSummary>, out: &mut String) {
-    let zero = reference.and_then(|channel| channel.first_s).unwrap_or(0.0);
-    for window in windows {
-        let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
-        let _ = write!(
-            out,
-            "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
-            window.channel,
-            window.start_s - zero,
-            window.frames_per_s,
-            window.bits_per_s
-        );
-        if window.errors > 0 {
-            let _ = write!(out, " {} errors", window.errors);
-        }
-        if window.lost > 0 {
-            let _ = write!(out, " {} lost", window.lost);
-        }
-        if window.incomplete {
-            out.push_str(", frames are missing");
-        }
-        out.push('\n');
+/// A window with its start relative to `zero_s`.
+pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
+    let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
+    let mut line = format!(
+        "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
+        window.channel,
+        window.start_s - zero_s,
+        window.frames_per_s,
+        window.bits_per_s
+    );
+    if window.errors > 0 {
+        let _ = write!(line, " {} errors", window.errors);
     }
+    if window.lost > 0 {
+        let _ = write!(line, " {} lost", window.lost);
+    }
+    if window.incomplete {
+        line.push_str(", frames are missing");
+    }
+    line
 }
 
 fn ids_text(ids: &[IdSummary], out: &mut String) {

@@ -38,6 +38,9 @@ fn push_date(out: &mut Vec<u8>, time_ns: i64) {
     out.extend_from_slice(text.as_bytes());
 }
 
+/// A file's last line.
+const END: &[u8] = b"End TriggerBlock\n";
+
 // Widths of the columns: a time, of it the whole seconds, and an identifier.
 const TIME_WIDTH: usize = 11;
 const SECONDS_WIDTH: usize = TIME_WIDTH - 7;
@@ -119,7 +122,13 @@ impl Encode for Encoder {
         if self.start_ns.is_none() {
             self.head(0, out);
         }
-        out.extend_from_slice(b"End TriggerBlock\n");
+        out.extend_from_slice(END);
+    }
+
+    fn provisional_end(&self, out: &mut Vec<u8>) {
+        if self.start_ns.is_some() {
+            out.extend_from_slice(END);
+        }
     }
 }
 

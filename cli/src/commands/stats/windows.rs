@@ -1,0 +1,41 @@
+//! The windows of a trace, on disk until the summary has been printed: a long trace has more of them than memory
+//! should hold.
+
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
+
+use anyhow::Context;
+use cantap::stats::{PeakSummary, Window};
+
+/// Windows in the order in which they were closed.
+pub(super) struct Windows {
+    /// One JSON object per line.
+    file: BufWriter<File>,
+    /// The first thing that went wrong.
+    result: io::Result<()>,
+}
+
+impl Windows {
+    /// None yet, in a file that nobody else sees.
+    pub(super) fn new() -> anyhow::Result<Self> {
+        let file = tempfile::tempfile()
+            .context("the windows need room for a temporary file; make some, or name a folder in TMPDIR")?;
+        Ok(Self { file: BufWriter::new(file), result: Ok(()) })
+    }
+
+    /// Adds a window.
+    pub(super) fn push(&mut self, window: &Window) {
+        if self.result.is_ok() {
+            let written = serde_json::to_writer(&mut self.file, &PeakSummary::of(window));
+            self.result = written.map_err(io::Error::from).and_then(|()| self.file.write_all(b"\n"));
+        }
+    }
+
+    /// Hands out all windows, each as the JSON object that it is.
+    pub(super) fn for_each(self, mut take: impl FnMut(&str) -> anyhow::Result<()>) -> anyhow::Result<()> {
+        self.result?;
+        let mut file = self.file.into_inner().map_err(io::IntoInnerError::into_error)?;
+        file.rewind()?;
+        BufReader::new(file).lines().try_for_each(|line| take(&line?))
+    }
+}

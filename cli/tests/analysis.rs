@@ -131,7 +131,7 @@ fn without_anything_the_virtual_device_is_shown() {
     let text = stdout(cantap().args(["monitor", "--once", "-t", "600ms", "--view", "trace"]));
     assert!(text.contains(" virtual listen-only: running"), "{text}");
     let reason = failure(cantap().args(["monitor", "-d", "/dev/nowhere", "--once"]));
-    assert!(reason.contains("give a bit rate, such as 500k"), "{reason}");
+    assert!(reason.contains("there is no device at '/dev/nowhere'"), "{reason}");
 }
 
 #[test]

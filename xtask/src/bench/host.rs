@@ -3,7 +3,6 @@
 use std::hint::black_box;
 use std::time::Instant;
 
-use anyhow::Result;
 use cantap::bits_on_bus;
 use cantap::device::{Intake, PIECE_BYTES};
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
@@ -20,7 +19,7 @@ const ROUNDS: usize = 5;
 const WANTED_MILLIONS: f64 = 10.0;
 
 /// Measures each kind of frame.
-pub fn run() -> Result<()> {
+pub fn run() {
     println!(
         "host: {FRAMES} frames of each kind, best of {ROUNDS}, in million frames per second on one core"
     );
@@ -37,7 +36,6 @@ pub fn run() -> Result<()> {
         let name = kind.name;
         println!("{name:<6} {lengths:>10.1} {decode:>10.1} {records:>10.1} {WANTED_MILLIONS:>8.1}");
     }
-    Ok(())
 }
 
 /// The fastest of several rounds, in million frames per second.

@@ -91,7 +91,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run()?,
             Subject::Bus => bus::run()?,
-            Subject::Host => host::run()?,
+            Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
             Subject::Monitor => monitor::run(args.seconds)?,
         }

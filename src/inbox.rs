@@ -43,6 +43,24 @@ impl Inbox {
         self.len -= count;
     }
 
+    /// The end of something too long has come: what follows is good again. Returns whether something was being thrown away.
+    pub const fn end_skipping(&mut self) -> bool {
+        core::mem::replace(&mut self.skipping, false)
+    }
+
+    /// Throws away an unfinished line: what stands before a zero that comes earlier than the next `end`. Returns whether there
+    /// was one.
+    pub fn drop_unfinished(&mut self, end: u8) -> bool {
+        match self.bytes[..self.len].iter().position(|&byte| byte == 0 || byte == end) {
+            Some(at) if self.bytes[at] == 0 => {
+                self.skipping = false;
+                self.skip(at);
+                true
+            }
+            _ => false,
+        }
+    }
+
     /// Shows `read` what stands before the first `end`, which is then dropped with it. `None` if there is
     /// no `end` yet; `Some(None)` if something longer than `max` was thrown away.
     pub fn take_until<R>(&mut self, end: u8, max: usize, read: impl FnOnce(&[u8]) -> R) -> Option<Option<R>> {

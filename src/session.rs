@@ -174,6 +174,9 @@ impl<'q, const N: usize> Session<'q, N> {
         match first {
             0 => {
                 self.inbox.skip(1);
+                if self.inbox.end_skipping() {
+                    self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
+                }
                 if !matches!(self.language, Language::Native { .. }) {
                     self.language = Language::Native { greeted: false };
                 }
@@ -234,6 +237,10 @@ impl<'q, const N: usize> Session<'q, N> {
     }
 
     fn handle_line(&mut self, board: &mut impl Board<'q, N>) -> bool {
+        // The next program speaks the native language: half a line of the last one must not swallow its greeting.
+        if self.inbox.drop_unfinished(b'\r') {
+            return true;
+        }
         let mut line = heapless::Vec::<u8, { Slcan::MAX_LINE }>::new();
         let Some(taken) =
             self.inbox.take_until(b'\r', Slcan::MAX_LINE, |bytes| line.extend_from_slice(bytes))

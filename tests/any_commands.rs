@@ -1,15 +1,14 @@
 //! Any sequence of commands, valid or not, on both channels, at any load: the device keeps answering, every
 //! request is answered once, and every frame is delivered or counted.
 
+mod arbitrary;
 mod fakes;
 
+use arbitrary::{channel, command};
 use cantap_firmware::queue::RecordQueue;
-use cantap_wire::message::{
-    ChannelConfig, Checksum, Filter, FrameKind, Mode, Modifier, Periodic, Trigger, TxFrame,
-};
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
-use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Frame, Id, Reply, Request};
-use fakes::{Bench, config, encode, numbered};
+use cantap_wire::{CHANNELS, Channel, Command, Event, Reply, Request};
+use fakes::{Bench, encode, numbered};
 use proptest::prelude::*;
 
 /// Small enough that a short burst overflows it.
@@ -46,103 +45,6 @@ enum Action {
         packets: Option<u8>,
     },
     Garbage(Vec<u8>),
-}
-
-fn channel() -> impl Strategy<Value = Channel> {
-    prop::sample::select(Channel::ALL.to_vec())
-}
-
-fn frame() -> impl Strategy<Value = Frame> {
-    (any::<u32>(), any::<bool>(), any::<bool>(), 0..16_u8, any::<[u8; 8]>()).prop_map(
-        |(id, extended, remote, dlc, data)| {
-            let id = if extended { Id::extended_truncated(id) } else { Id::standard_truncated(id) };
-            Frame::from_bus(id, remote, dlc, data)
-        },
-    )
-}
-
-fn channel_config() -> impl Strategy<Value = ChannelConfig> {
-    let mode =
-        prop::sample::select(vec![Mode::ListenOnly, Mode::Normal, Mode::Loopback, Mode::SilentLoopback]);
-    let good = (mode, any::<[bool; 4]>()).prop_map(|(mode, flags)| ChannelConfig {
-        one_shot: flags[0],
-        manual_recovery: flags[1],
-        omit_data: flags[2],
-        omit_stamps: flags[3],
-        ..config(mode)
-    });
-    let wild = any::<(u16, u8, u8, u8)>().prop_map(|(prescaler, segment1, segment2, jump_width)| {
-        ChannelConfig::listen_only(BitTiming { prescaler, segment1, segment2, jump_width })
-    });
-    prop_oneof![6 => good, 1 => wild]
-}
-
-fn filter() -> impl Strategy<Value = Filter> {
-    let kind = prop::sample::select(vec![FrameKind::Data, FrameKind::Remote, FrameKind::Any]);
-    let number = prop_oneof![4 => 0..0x800_u32, 1 => any::<u32>()];
-    (any::<bool>(), kind, number.clone(), number).prop_map(|(extended, kind, id, mask)| Filter {
-        extended,
-        kind,
-        id,
-        mask,
-    })
-}
-
-fn modifier() -> impl Strategy<Value = Modifier> {
-    prop_oneof![
-        (0..9_u8, 0..9_u8, 0..10_u8).prop_map(|(byte, low_bit, bits)| Modifier::Counter {
-            byte,
-            low_bit,
-            bits
-        }),
-        (0..9_u8).prop_map(|byte| Modifier::Checksum { byte, algorithm: Checksum::Crc8J1850 }),
-        any::<u8>().prop_map(|byte| Modifier::Random { byte }),
-    ]
-}
-
-fn command() -> impl Strategy<Value = Command> {
-    let at = prop::option::of(prop_oneof![0..50_000_000_u64, any::<u64>()]);
-    let tag = prop_oneof![8 => 0..1000_u32, 1 => any::<u32>()];
-    let sent = (tag, frame(), at).prop_map(|(tag, frame, at_ticks)| TxFrame { tag, frame, at_ticks });
-    let periodic = (
-        frame(),
-        prop_oneof![500..100_000_u32, any::<u32>()],
-        0..5_u32,
-        prop::collection::vec(modifier(), 0..4),
-    )
-        .prop_map(|(frame, period_ticks, count, modifiers)| Periodic {
-            frame,
-            period_ticks,
-            count,
-            modifiers: modifiers.into_iter().collect(),
-        });
-    let trigger =
-        (filter(), frame(), 0..4_u32).prop_map(|(filter, reply, count)| Trigger { filter, reply, count });
-    let simple = prop::sample::select(vec![
-        Command::Status,
-        Command::Time,
-        Command::Identify { seconds: 1 },
-        Command::SaveDefaults,
-        Command::ClearDefaults,
-        Command::Hello { protocol: 99 },
-    ]);
-    prop_oneof![
-        4 => (channel(), prop::option::weighted(0.8, channel_config()))
-            .prop_map(|(channel, config)| Command::Open { channel, config }),
-        2 => channel().prop_map(|channel| Command::Close { channel }),
-        1 => channel().prop_map(|channel| Command::Abort { channel }),
-        1 => channel().prop_map(|channel| Command::Recover { channel }),
-        1 => channel().prop_map(|channel| Command::Registers { channel }),
-        2 => (channel(), prop::collection::vec(filter(), 0..40))
-            .prop_map(|(channel, filters)| Command::SetFilters { channel, filters: filters.into_iter().collect() }),
-        4 => (channel(), prop::collection::vec(sent, 0..=8))
-            .prop_map(|(channel, frames)| Command::Send { channel, frames: frames.into_iter().collect() }),
-        2 => (channel(), 0..40_u8, prop::option::of(periodic))
-            .prop_map(|(channel, slot, entry)| Command::SetPeriodic { channel, slot, entry }),
-        2 => (channel(), 0..10_u8, prop::option::of(trigger))
-            .prop_map(|(channel, slot, entry)| Command::SetTrigger { channel, slot, entry }),
-        2 => simple,
-    ]
 }
 
 fn action() -> impl Strategy<Value = Action> {

@@ -140,6 +140,16 @@ fn garbage_is_dropped_and_the_next_command_answered() {
 }
 
 #[test]
+fn a_request_behind_something_too_long_and_its_zero_is_answered() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.say(&[0xFF; 1500]);
+    bench.say(&[0]);
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert_eq!(status.bad_requests, 1);
+}
+
+#[test]
 fn every_request_of_a_flood_is_answered_while_nothing_is_read() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::opened(&queue, Mode::ListenOnly);

@@ -269,3 +269,16 @@ fn the_native_language_takes_over_from_slcan() {
     let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
     assert_eq!(status.channels[0].open, None);
 }
+
+#[test]
+fn half_a_line_does_not_keep_the_native_language_from_taking_over() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.say(b"A");
+    bench.greet();
+    // So long that the rest of the line is being skipped.
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.say(&[b't'; 200]);
+    bench.greet();
+}

@@ -1,11 +1,16 @@
 //! How a channel is opened; the same options in every command that opens one.
 
+use std::time::Duration;
+
 use anyhow::{Context, bail};
 use cantap::filter::Filter;
 use cantap::hw_filter::{self, Compiled};
+use cantap::recovery::Recovery;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode};
 use cantap::{Address, Channel, Device};
 
+use crate::args;
+use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
 
 /// Bit rate of a virtual bus where none was given: its simulated nodes take any.
@@ -22,9 +27,10 @@ pub struct ChannelArgs {
     /// Send each frame once: no retransmission after an error or lost arbitration.
     #[arg(long)]
     one_shot: bool,
-    /// How to leave bus-off: by the controller itself, as it does unless told otherwise, or only when asked.
-    #[arg(long, value_enum)]
-    recovery: Option<Recovery>,
+    /// How to leave bus-off: auto, by the controller itself, as it does unless told otherwise; manual, not at all while the
+    /// command runs; or after a time, such as 100ms.
+    #[arg(long, value_name = "auto|manual|TIME", value_parser = recovery)]
+    recovery: Option<RecoveryArg>,
     /// Leave data bytes out of the stream, to save bandwidth.
     #[arg(long)]
     no_data: bool,
@@ -45,12 +51,24 @@ enum ModeArg {
     SilentLoopback,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
-enum Recovery {
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum RecoveryArg {
     /// After 128 times 11 recessive bits.
     Auto,
-    /// Not before the host asks for it.
+    /// Never.
     Manual,
+    /// So long after it went off, by this program.
+    After(Duration),
+}
+
+fn recovery(text: &str) -> Result<RecoveryArg, String> {
+    match text {
+        "auto" => Ok(RecoveryArg::Auto),
+        "manual" => Ok(RecoveryArg::Manual),
+        _ => args::duration(text)
+            .map(RecoveryArg::After)
+            .map_err(|_| "write auto, manual, or a time, such as 100ms".to_owned()),
+    }
 }
 
 /// What a channel is to be opened with.
@@ -80,6 +98,15 @@ impl ChannelArgs {
             Mode::Loopback => ModeArg::Loopback,
             Mode::SilentLoopback => ModeArg::SilentLoopback,
         });
+    }
+
+    /// Brings channels back from bus-off while the command runs, if the user says so.
+    pub fn rescue<'d>(&self, device: &'d Device) -> Rescue<'d> {
+        let recovery = match self.recovery {
+            Some(RecoveryArg::After(time)) => Some(Recovery::new(time)),
+            _ => None,
+        };
+        Rescue::new(device, recovery)
     }
 
     /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before
@@ -173,7 +200,7 @@ impl ChannelArgs {
             one_shot: base.one_shot || self.one_shot,
             manual_recovery: self
                 .recovery
-                .map_or(base.manual_recovery, |recovery| recovery == Recovery::Manual),
+                .map_or(base.manual_recovery, |recovery| recovery != RecoveryArg::Auto),
             omit_data: base.omit_data || self.no_data,
             omit_stamps: base.omit_stamps || self.no_stamps,
             ..base

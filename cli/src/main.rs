@@ -11,6 +11,7 @@ mod live;
 mod losses;
 mod meter;
 mod monitor;
+mod rescue;
 mod sending;
 mod timing_args;
 mod trigger_args;

@@ -7,9 +7,11 @@ use anyhow::bail;
 use cantap::Device;
 use cantap::device::Transmission;
 use cantap::transmit::Stream;
-use cantap::wire::record::TransmitFailure;
+use cantap::wire::message::ChannelStatus;
+use cantap::wire::record::{ErrorState, TransmitFailure};
 
 use crate::interrupt;
+use crate::rescue::Rescue;
 
 /// A frame that nobody acknowledged for so long is given up.
 pub const GIVE_UP_AFTER: Duration = Duration::from_secs(1);
@@ -77,23 +79,34 @@ impl Tally {
 /// Looks after a bus while frames wait for their time: silence alone does not tell that it is dead.
 pub struct BusWatch<'d> {
     device: &'d Device,
+    rescue: Rescue<'d>,
     look_at: Instant,
 }
 
 impl<'d> BusWatch<'d> {
-    /// Watches the buses of a device.
-    pub fn new(device: &'d Device) -> Self {
-        Self { device, look_at: Instant::now() + GIVE_UP_AFTER }
+    /// Watches the buses of a device, and brings its channels back from bus-off if it is to.
+    pub fn new(device: &'d Device, rescue: Rescue<'d>) -> Self {
+        Self { device, rescue, look_at: Instant::now() + GIVE_UP_AFTER }
+    }
+
+    /// Takes notice of how transmissions ended.
+    pub fn note(&mut self, ends: &[Transmission]) {
+        self.rescue.note(ends);
     }
 
     /// False after Ctrl-C, and where a controller is so far gone (error passive, bus-off) that nobody hears it.
     pub fn goes_on(&mut self) -> bool {
         const PASSIVE: u8 = 128;
+        self.rescue.wait();
         if self.look_at <= Instant::now() {
             self.look_at = Instant::now() + GIVE_UP_AFTER;
             // An error is told by the next request.
             let channels = self.device.status().map(|status| status.channels);
-            if channels.is_ok_and(|channels| channels.iter().any(|channel| channel.tec >= PASSIVE)) {
+            let is_gone = |channel: &ChannelStatus| {
+                let is_rescued = self.rescue.is_on_duty() && channel.state == ErrorState::BusOff;
+                channel.tec >= PASSIVE && !is_rescued
+            };
+            if channels.is_ok_and(|channels| channels.iter().any(is_gone)) {
                 return false;
             }
         }
@@ -102,8 +115,11 @@ impl<'d> BusWatch<'d> {
 }
 
 /// Waits for the rest of a stream, until nothing ends for [`GIVE_UP_AFTER`] or Ctrl-C, and adds it up.
-pub fn finish(stream: &mut Stream<'_>, tally: &mut Tally) -> anyhow::Result<()> {
-    stream.finish(|since| since < GIVE_UP_AFTER && !interrupt::requested())?;
+pub fn finish(stream: &mut Stream<'_>, tally: &mut Tally, rescue: &mut Rescue<'_>) -> anyhow::Result<()> {
+    stream.finish(|since| {
+        rescue.wait();
+        since < GIVE_UP_AFTER && !interrupt::requested()
+    })?;
     tally.add(&stream.take_ended())
 }
 
@@ -117,7 +133,9 @@ fn sentence(reason: TransmitFailure) -> &'static str {
         }
         TransmitFailure::Aborted => "they were aborted",
         TransmitFailure::Closed => "the channel was closed before",
-        TransmitFailure::BusOff => "the controller went bus-off; check bit rate, wiring and termination",
+        TransmitFailure::BusOff => {
+            "the controller went bus-off; check bit rate, wiring and termination, and see --recovery"
+        }
         TransmitFailure::Overtaken => "their period is shorter than the bus allows; choose a longer --period",
     }
 }

@@ -182,3 +182,64 @@ fn a_capture_takes_filters_modes_and_timings() {
     assert_eq!(code, Some(0));
     assert!(frames(&out).iter().all(|frame| frame.ends_with("#0000000000000000")), "{out}");
 }
+
+#[test]
+fn a_channel_leaves_bus_off_by_itself_and_sends_what_waited() {
+    // 32 errors of its own make a controller bus-off.
+    let (code, out, err) = cantap("send -d virtual:load=0,disturb=32 can0 123#11 124#22");
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(frames(&out), ["can0 123#11 T", "can0 124#22 T"]);
+    // One less, and it never went off.
+    let (code, out, _) = cantap("send -d virtual:load=0,disturb=31 can0 123#11");
+    assert_eq!((code, frames(&out).len()), (Some(0), 1));
+}
+
+#[test]
+fn with_manual_recovery_what_waits_fails_and_is_told_why() {
+    let line = "send -d virtual:load=0,disturb=32 can0 123#11 124#22 --recovery manual";
+    let (code, out, err) = cantap(line);
+    assert_eq!((code, out.as_str()), (Some(1), ""));
+    assert!(err.contains("2 of 2 frames were not sent: the controller went bus-off"), "{err}");
+    assert!(err.contains("--recovery"), "{err}");
+}
+
+#[test]
+fn after_a_time_the_command_brings_the_channel_back() {
+    let line = "gen -d virtual:load=0,disturb=32 can1 -g 2 -I 42A -L 2 -D i -n 400 -v --recovery 100ms";
+    let (code, out, err) = cantap(line);
+    assert_eq!(code, Some(1), "{err}");
+    assert!(err.contains("channel 2 was bus-off and joins the bus again"), "{err}");
+    // What was queued when it went off failed; what came when it was back went out.
+    let sent = frames(&out);
+    assert!(!sent.is_empty() && sent.last().is_some_and(|frame| frame == "can1 42A#8F01 T"), "{out}{err}");
+    assert!(err.contains(&format!("{} of 400 frames were not sent", 400 - sent.len())), "{err}");
+    let (code, _, err) = cantap("send -d virtual can0 123# --recovery soon");
+    assert!(code == Some(2) && err.contains("write auto, manual, or a time"), "{err}");
+}
+
+/// As Linux's error frames have them: byte 2 tells the kind, byte 3 the place.
+#[test]
+fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
+    let capture = |bus: &str| {
+        let (code, out, err) = cantap(&format!("capture -d virtual:{bus},frames=std8 -c 1 -b 500k -t 500ms"));
+        assert_eq!(code, Some(0), "{bus}: {err}");
+        let details = |class: &str| -> Vec<String> {
+            let lines =
+                out.lines().filter_map(|line| line.split_once(class).map(|(_, data)| data.to_owned()));
+            lines.collect()
+        };
+        // A bus error of the protocol with counters; and one without a kind: those suppressed, and how many.
+        (details(" 20000288#"), details(" 20000080#"))
+    };
+    let (destroyed, _) = capture("errors=50,load=80");
+    for (kind, part) in [("stuff", "00000400"), ("form", "00000200"), ("CRC", "00000008")] {
+        assert!(destroyed.iter().any(|data| data.starts_with(part)), "no {kind} error in {destroyed:?}");
+    }
+    // What nobody acknowledges ends in the sender's error flag, again and again.
+    let (alone, suppressed) = capture("ack=no,load=100");
+    assert!(!alone.is_empty() && alone.iter().all(|data| data.starts_with("00000200")), "{alone:?}");
+    assert!(alone.len() < 500, "{} error records in half a second", alone.len());
+    let count = |data: &String| u64::from_str_radix(&format!("{}{}", &data[6..8], &data[4..6]), 16).unwrap();
+    let suppressed: u64 = suppressed.iter().filter(|data| data.starts_with("40")).map(count).sum();
+    assert!(suppressed > 500, "{suppressed}");
+}

@@ -15,6 +15,7 @@ pub mod hw_filter;
 pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;
+pub mod recovery;
 pub mod replay;
 #[cfg(feature = "signals")]
 pub mod search;

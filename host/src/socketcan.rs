@@ -45,12 +45,13 @@ const AT_LEAST: u8 = 0x80;
 const SUPPRESSED: u8 = 0x40;
 
 const STAGES: [LossStage; 4] = [LossStage::Controller, LossStage::Queue, LossStage::Link, LossStage::Host];
-const FAILURES: [TransmitFailure; 5] = [
+const FAILURES: [TransmitFailure; 6] = [
     TransmitFailure::ArbitrationLost,
     TransmitFailure::BusError,
     TransmitFailure::Aborted,
     TransmitFailure::Closed,
     TransmitFailure::BusOff,
+    TransmitFailure::Overtaken,
 ];
 
 /// An error frame: its classes, without [`ERROR_FLAG`], and its data.

@@ -172,7 +172,7 @@ fn two_channels_on_one_wire_hear_each_other() {
 #[test]
 fn whatever_only_listens_never_drives_the_bus() {
     let pace = Pace::RealTime;
-    let bus = Options { bitrate_bps: Some(250_000), error_percent: 2.0, pace, ..options(60.0, Frames::Mix) };
+    let bus = Options { bitrate_bps: Some(250_000), pace, ..options(60.0, Frames::Mix) };
     let connection = start(bus).unwrap();
     let witness = connection.witness.clone();
     let device = Device::over(connection.into_link(), "virtual").unwrap();
@@ -280,6 +280,43 @@ fn behind_a_pseudo_terminal_it_is_a_serial_port_and_can_be_opened_again() {
     assert!(Device::open(&address).is_err());
 }
 
+/// As a board's port comes back under the same name, with what was saved in its flash.
+#[cfg(all(unix, feature = "serial"))]
+#[test]
+fn behind_a_pseudo_terminal_it_comes_back_after_a_reset_and_not_from_the_bootloader() {
+    use cantap::device::Address;
+    let (pace, started) = (Pace::RealTime, Instant::now());
+    let terminal =
+        cantap::virtual_device::open_terminal(Options { pace, ..options(60.0, Frames::Std8) }).unwrap();
+    let address: Address = terminal.path().parse().unwrap();
+    let device = Device::open(&address).unwrap();
+    let normal = config(&device, Mode::Normal);
+    device.configure(Channel::Can1, normal).unwrap();
+    device.save_defaults().unwrap();
+    device.listen(Channel::Can1, BITRATE).unwrap();
+    std::thread::sleep(Duration::from_millis(300));
+    device.reset().unwrap();
+    let deadline = Instant::now() + Duration::from_secs(5);
+    // Whoever has it open finds no session any more.
+    while device.status().is_ok() {
+        assert!(Instant::now() < deadline, "it was not restarted");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+    drop(device);
+    let device = Device::open(&address).unwrap();
+    // The firmware's time began anew.
+    let since_reset = Duration::from_millis(device.time().unwrap() / 12_000);
+    assert!(since_reset + Duration::from_millis(300) < started.elapsed() && terminal.is_running());
+    assert_eq!(device.defaults(Channel::Can1).unwrap().unwrap().config, normal);
+    assert!(device.status().unwrap().channels.iter().all(|channel| channel.open.is_none()));
+    device.bootloader().unwrap();
+    let deadline = Instant::now() + Duration::from_secs(5);
+    while terminal.is_running() {
+        assert!(Instant::now() < deadline, "it is still there");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
 #[test]
 fn a_log_is_replayed_at_its_own_times() {
     let file = tempfile::NamedTempFile::with_suffix(".log").unwrap();
@@ -300,4 +337,105 @@ fn a_log_is_replayed_at_its_own_times() {
     assert_eq!((texts(1), texts(2)), (vec!["123#11".into(), "124#33".into()], vec!["456#22".into()]));
     let times: Vec<i64> = of(1).map(|record| record.time_ns).collect();
     assert!((times[1] - times[0] - 10_000_000).abs() < 5000, "{times:?}");
+}
+
+/// One channel's errors and changes of state until `enough`, and the device's own count of errors.
+fn errors_of(bus: Options, frames: &[&str]) -> (Vec<TraceEvent>, u32) {
+    let device = open(bus);
+    device.open_channel(Channel::Can1, Some(config(&device, Mode::Normal))).unwrap();
+    let frames: Vec<TxFrame> = (1..)
+        .zip(frames)
+        .map(|(tag, text)| TxFrame { tag, frame: text.parse().unwrap(), at_ticks: None })
+        .collect();
+    device.send(Channel::Can1, &frames).unwrap();
+    std::thread::sleep(Duration::from_millis(30));
+    device.close_channel(Channel::Can1).unwrap();
+    let errors = device.stop().unwrap().channels[0].bus_errors;
+    let events = device.records().map(|record| record.unwrap().event);
+    (events.filter(|event| !matches!(event, TraceEvent::Frame { .. })).collect(), errors)
+}
+
+#[test]
+fn errors_states_and_recovery_are_told_in_order_and_every_error_counted() {
+    use ErrorState::{Active, BusOff, Passive, Warning};
+    let quiet = || options(0.0, Frames::Std8);
+    let (events, errors) = errors_of(Options { disturb: 32, ..quiet() }, &["100#01"]);
+    assert_eq!(errors, 32);
+    let states: Vec<_> = events
+        .iter()
+        .filter_map(|event| match event {
+            TraceEvent::State { state, counters } => Some((*state, counters.map(|(tec, _)| tec))),
+            _ => None,
+        })
+        .collect();
+    assert_eq!(states, [(Warning, Some(96)), (Passive, Some(128)), (BusOff, Some(255)), (Active, Some(0))]);
+    let mut kinds = Vec::new();
+    let mut counted = 0;
+    for event in &events {
+        match event {
+            TraceEvent::BusError { kind, counters } => {
+                kinds.extend(*kind);
+                counted += 1;
+                // Eight for each, from the first on.
+                assert_eq!(
+                    counters.map(|(tec, _)| u32::from(tec)),
+                    Some((counted * 8).min(255)),
+                    "{events:?}"
+                );
+            }
+            TraceEvent::ErrorsSuppressed { count } => counted += *count,
+            _ => {}
+        }
+    }
+    assert_eq!(counted, errors);
+    assert!(kinds.contains(&BusErrorKind::BitDominant) && kinds.contains(&BusErrorKind::BitRecessive));
+    let (events, errors) = errors_of(Options { acknowledge: false, ..quiet() }, &["100#01"]);
+    let suppressed: u32 = events
+        .iter()
+        .map(|event| match event {
+            TraceEvent::ErrorsSuppressed { count } => *count,
+            TraceEvent::BusError { kind, .. } => {
+                assert_eq!(*kind, Some(BusErrorKind::Acknowledgment));
+                1
+            }
+            _ => 0,
+        })
+        .sum();
+    assert_eq!(suppressed, errors);
+    // A lone node stays error passive (ISO 11898-1:2015, 12.1.4.2), however long.
+    assert!(!events.iter().any(|event| matches!(event, TraceEvent::State { state: BusOff, .. })));
+}
+
+#[test]
+fn a_channel_with_manual_recovery_stays_off_until_it_is_told_to_come_back() {
+    let device = open(Options { disturb: 32, ..options(0.0, Frames::Std8) });
+    let transmissions = device.transmissions();
+    let manual = ChannelConfig { manual_recovery: true, ..config(&device, Mode::Normal) };
+    device.open_channel(Channel::Can1, Some(manual)).unwrap();
+    let refused = device.recover(Channel::Can1).unwrap_err().to_string();
+    assert!(refused.contains("not bus-off"), "{refused}");
+    let send = |tag| {
+        let frame: Frame = "100#01".parse().unwrap();
+        device.send(Channel::Can1, &[TxFrame { tag, frame, at_ticks: None }]).unwrap();
+        let end = transmissions.recv_timeout(Duration::from_secs(5)).unwrap();
+        (end.tag, end.result.map(|_| ()))
+    };
+    assert_eq!(send(1), (1, Err(TransmitFailure::BusOff)));
+    // It is not forgotten that it is off: frames fail at once, with the reason.
+    assert_eq!(send(2), (2, Err(TransmitFailure::BusOff)));
+    assert_eq!(device.status().unwrap().channels[0].state, ErrorState::BusOff);
+    let mut recovery = cantap::recovery::Recovery::new(Duration::from_millis(40));
+    let asked = Instant::now();
+    let recovered = loop {
+        let recovered = recovery.look(&device).unwrap();
+        if !recovered.is_empty() {
+            break recovered;
+        }
+        assert!(asked.elapsed() < Duration::from_secs(10));
+        std::thread::sleep(Duration::from_millis(5));
+    };
+    assert_eq!(recovered, [Channel::Can1]);
+    assert!(asked.elapsed() >= Duration::from_millis(40));
+    assert_eq!(send(3), (3, Ok(())));
+    assert_eq!(device.status().unwrap().channels[0].state, ErrorState::Active);
 }

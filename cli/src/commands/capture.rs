@@ -19,6 +19,7 @@ use crate::channel_args::ChannelArgs;
 use crate::interrupt;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
+use crate::rescue::Rescue;
 use crate::trigger_args::TriggerArgs;
 
 /// The command line.
@@ -134,7 +135,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let mut meters = Channel::ALL.map(|channel| Meter::new(bitrate(channel)));
     let mut records = device.records();
-    let end = write_until_asked(args, &mut records, &mut sink, &mut meters, started);
+    let mut rescue = args.open.rescue(&device);
+    let end = write_until_asked(args, &mut records, &mut sink, &mut meters, &mut rescue);
     // What was captured until now is written, whatever came in between.
     let seconds = started.elapsed().as_secs_f64();
     let end = end.and_then(|end| match end {
@@ -183,10 +185,12 @@ fn write_until_asked(
     records: &mut Records,
     sink: &mut Sink,
     meters: &mut [Meter; 2],
-    started: Instant,
+    rescue: &mut Rescue<'_>,
 ) -> anyhow::Result<End> {
-    let mut flushed = Instant::now();
+    let started = Instant::now();
+    let mut flushed = started;
     loop {
+        rescue.look()?;
         if interrupt::requested() || args.time.is_some_and(|time| started.elapsed() >= time) {
             return Ok(End::Asked);
         }

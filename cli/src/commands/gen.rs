@@ -183,14 +183,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let pace = Pace { shortest_gap: gap, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut tally = Tally::new(!args.verbose);
-    let mut bus = BusWatch::new(&device);
+    let mut bus = BusWatch::new(&device, args.open.rescue(&device));
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
     while args.frames.is_none_or(|frames| generator.count < frames) {
         let frame = generator.frame();
         if !bus.goes_on() || !replay.push(0, args.channel, frame, || bus.goes_on())? {
             break;
         }
-        tally.add(&replay.take_ended())?;
+        let ends = replay.take_ended();
+        bus.note(&ends);
+        tally.add(&ends)?;
     }
     if !interrupt::requested() {
         replay.finish(|_| bus.goes_on())?;

@@ -124,7 +124,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut tally = Tally::new(!args.verbose);
-    let mut bus = BusWatch::new(&device);
+    let mut bus = BusWatch::new(&device, args.open.rescue(&device));
     let (started, left_out) = (Instant::now(), args.play(&mut replay, &mut tally, &mut bus)?);
     // The last frames may be due long after the others.
     replay.finish(|_| bus.goes_on())?;
@@ -211,7 +211,9 @@ impl Args {
                     return Ok(left_out);
                 }
                 pushed += 1;
-                tally.add(&replay.take_ended())?;
+                let ends = replay.take_ended();
+                bus.note(&ends);
+                tally.add(&ends)?;
             }
             if first_ns.is_none() {
                 bail!(

@@ -15,6 +15,7 @@ use cantap::{Address, Channel, Device, Frame, Id, hw_filter, signals};
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::databases::DatabaseArgs;
+use crate::rescue::Rescue;
 use crate::sending::{self, GIVE_UP_AFTER, Tally};
 use crate::{args, interrupt};
 
@@ -79,6 +80,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let device = Device::open(&args.device)?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
     let mut tally = Tally::new(args.quiet);
+    let mut rescue = args.open.rescue(&device);
     let waiting = match (triggers, periodic) {
         (Some(triggers), _) => {
             let slots = device.hello().trigger_slots;
@@ -89,7 +91,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             for (slot, trigger) in (0..).zip(triggers) {
                 device.set_trigger(args.channel, slot, Some(trigger))?;
             }
-            args.watch(stream, TRIGGER_TAG, &mut tally, args.count.map(u64::from))?
+            args.watch(stream, TRIGGER_TAG, &mut tally, args.count.map(u64::from), &mut rescue)?
         }
         (None, Some((period, modifiers))) => {
             let ticks = period.as_secs_f64() * f64::from(device.hello().tick_hz);
@@ -111,9 +113,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                     .with_context(|| format!("--period {period:?}"))?;
             }
             let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
-            args.watch(stream, DEVICE_TAG, &mut tally, wanted)?
+            args.watch(stream, DEVICE_TAG, &mut tally, wanted, &mut rescue)?
         }
-        (None, None) => args.send_now(&device, &frames, &mut tally)?,
+        (None, None) => args.send_now(&device, &frames, &mut tally, &mut rescue)?,
     };
     device.stop()?;
     tally.verdict(waiting)?;
@@ -173,7 +175,13 @@ impl Args {
     }
 
     /// Sends the frames one after the other, `count` times. Returns how many are still waiting.
-    fn send_now(&self, device: &Device, frames: &[Frame], tally: &mut Tally) -> anyhow::Result<usize> {
+    fn send_now(
+        &self,
+        device: &Device,
+        frames: &[Frame],
+        tally: &mut Tally,
+        rescue: &mut Rescue<'_>,
+    ) -> anyhow::Result<usize> {
         let mut stream = Stream::new(device);
         let started = Instant::now();
         let mut last = Instant::now();
@@ -182,19 +190,21 @@ impl Args {
                 let mut stuck = false;
                 let go_on = || {
                     stuck = last.elapsed() > GIVE_UP_AFTER;
+                    rescue.wait();
                     !stuck && !self.is_over(started)
                 };
                 if stream.push(self.channel, *frame, None, go_on)?.is_none() || self.is_over(started) {
                     break 'rounds;
                 }
                 let ends = stream.take_ended();
+                rescue.note(&ends);
                 if !ends.is_empty() {
                     last = Instant::now();
                     tally.add(&ends)?;
                 }
             }
         }
-        sending::finish(&mut stream, tally)?;
+        sending::finish(&mut stream, tally, rescue)?;
         Ok(stream.under_way())
     }
 
@@ -205,12 +215,14 @@ impl Args {
         first_tag: u32,
         tally: &mut Tally,
         wanted: Option<u64>,
+        rescue: &mut Rescue<'_>,
     ) -> anyhow::Result<usize> {
         let started = Instant::now();
         let period = self.period.unwrap_or_default();
         let mut last = Instant::now();
         while !self.is_over(started) && wanted.is_none_or(|wanted| tally.sent < wanted) {
             stream.wait(LOOK_EVERY)?;
+            rescue.look()?;
             let mut ends = stream.take_ended();
             ends.retain(|end| end.tag >= first_tag);
             if !ends.is_empty() {

@@ -38,6 +38,8 @@ pub use serial::{Board, list};
 pub use stamps::{BitLengths, tighten};
 
 use crate::TraceRecord;
+#[cfg(all(test, feature = "virtual"))]
+pub(crate) use reader::encode;
 use reader::{Answer, Order, Shared};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.

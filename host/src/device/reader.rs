@@ -173,7 +173,7 @@ impl Shared {
 }
 
 /// A request as it goes over the wire.
-pub(super) fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
+pub(crate) fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
     let mut message = [0; MAX_REQUEST + CRC_LEN];
     let mut out = vec![0; max_encoded_len(MAX_REQUEST)];
     let encoded = framing::encode(request, &mut message, &mut out).ok_or(DeviceError::RequestTooLong)?;

@@ -99,7 +99,8 @@ impl Chip for VirtualChip {
     fn identify(&mut self, _seconds: u8) {}
 
     fn reset(&mut self) {
-        self.ending = Some(Ending::Restart);
+        // Asked for the bootloader, the logic asks for a reset too, in case that there is none.
+        self.ending.get_or_insert(Ending::Restart);
     }
 
     fn bootloader(&mut self) -> bool {

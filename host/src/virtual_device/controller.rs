@@ -263,7 +263,8 @@ impl Node for Controller {
             let one_shot = self.config.is_some_and(|config| config.one_shot);
             if std::mem::take(&mut self.aborting) {
                 self.finish_first(Outcome::Aborted);
-            } else if one_shot || self.state() == ErrorState::BusOff {
+            } else if one_shot {
+                // Otherwise the mailbox waits, through bus-off too (RM0090 Rev 21 §32.7.1: it is emptied by success or abort).
                 self.finish_first(Outcome::Error);
             }
         }

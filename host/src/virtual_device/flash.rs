@@ -30,8 +30,11 @@ impl Flash {
     /// Saves as the board does. Returns whether it worked and the file, if there is one, has it.
     pub fn save(&mut self, bytes: &[u8]) -> bool {
         let saved = saved::save(self, bytes);
-        let image: Vec<u8> = self.words.iter().flat_map(|word| word.to_le_bytes()).collect();
-        saved && self.file.as_ref().is_none_or(|file| std::fs::write(file, image).is_ok())
+        let kept = self.file.as_ref().is_none_or(|file| {
+            let image: Vec<u8> = self.words.iter().flat_map(|word| word.to_le_bytes()).collect();
+            std::fs::write(file, image).is_ok()
+        });
+        saved && kept
     }
 
     /// Reads what was saved last into `out`, and returns its length.

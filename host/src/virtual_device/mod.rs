@@ -8,6 +8,8 @@
 //! together, in steps that follow the wall clock. A thread that was held up catches up, and gives the host the
 //! time to read that it missed as well.
 
+#[cfg(test)]
+mod any_commands;
 mod board;
 mod check;
 mod controller;

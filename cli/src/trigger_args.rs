@@ -36,7 +36,8 @@ impl TriggerArgs {
         let decoder = self.databases.load(false)?;
         let condition = Condition::new(text, &decoder).map_err(|error| anyhow!("--trigger: {error}"))?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
-        let window = Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post) };
+        let window =
+            Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), once: self.once };
         Ok(Some(Trigger::new(condition, window)))
     }
 

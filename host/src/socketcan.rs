@@ -24,8 +24,8 @@ const RESTARTED: u32 = 0x100;
 const COUNTERS: u32 = 0x200;
 
 // Details of CONTROLLER, data[1].
-const OVERFLOW: u8 = 0x01 | 0x02;
 const RX_OVERFLOW: u8 = 0x01;
+const TX_OVERFLOW: u8 = 0x02;
 const WARNING: u8 = 0x04 | 0x08;
 const PASSIVE: u8 = 0x10 | 0x20;
 const ACTIVE: u8 = 0x40;
@@ -134,12 +134,15 @@ impl ErrorFrame {
         let counters = has(COUNTERS).then_some((data[6], data[7]));
         let number = u32::from_le_bytes([data[2], data[3], data[4], data[5]]);
         let bus_error = TraceEvent::BusError { kind: self.kind(), counters };
-        if has(CONTROLLER) && data[1] & OVERFLOW != 0 {
+        if has(CONTROLLER) && data[1] & RX_OVERFLOW != 0 {
             let stage = STAGES.get((data[0] & !AT_LEAST).wrapping_sub(1) as usize).copied();
             // A count only stands here if nobody else claims the bytes.
             let counted = number > 0 && !has(PROTOCOL);
             let (count, at_least) = if counted { (number, data[0] & AT_LEAST != 0) } else { (1, true) };
             return (TraceEvent::Lost { stage, count, at_least }, None);
+        }
+        if has(CONTROLLER) && data[1] & TX_OVERFLOW != 0 {
+            return (TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted }, None);
         }
         let state = if has(BUS_OFF) {
             Some(ErrorState::BusOff)
@@ -224,6 +227,8 @@ mod tests {
         assert_eq!(events(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]), (passive, None));
         let lost = TraceEvent::Lost { stage: None, count: 1, at_least: true };
         assert_eq!(events(0x004, [0, 1, 0, 0, 0, 0, 0, 0]), (lost, None));
+        let not_sent = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
+        assert_eq!(events(0x004, [0, 2, 0, 0, 0, 0, 0, 0]), (not_sent, None));
         let stuff = TraceEvent::BusError { kind: Some(BusErrorKind::Stuff), counters: None };
         assert_eq!(events(0x088, [0, 0, 4, 0, 0, 0, 0, 0]), (stuff, None));
         let warning = TraceEvent::State { state: ErrorState::Warning, counters: None };

@@ -23,6 +23,8 @@ pub struct Window {
     pub pre_ns: i64,
     /// How long after the event records are kept, in nanoseconds.
     pub post_ns: i64,
+    /// Only the first event counts: those after it do not lengthen the time.
+    pub once: bool,
 }
 
 /// What happened so far.
@@ -80,7 +82,8 @@ impl Trigger {
         let now_ns = record.time_ns;
         self.forget_before(now_ns.saturating_sub(self.window.pre_ns));
         let holds = self.condition.holds(record);
-        if holds && (!self.held || self.condition.is_about_frames()) {
+        let is_event = holds && (!self.held || self.condition.is_about_frames());
+        if is_event && !(self.window.once && self.counts.events > 0) {
             self.counts.events += 1;
             self.counts.forgotten += self.overflowed.drain(..).map(|(_, count)| count).sum::<u64>();
             self.open_until_ns = Some(now_ns.saturating_add(self.window.post_ns));
@@ -170,7 +173,11 @@ mod tests {
         let database = dbc::parse("x.dbc", text).unwrap();
         let decoder = Decoder::new(vec![Source { channel: None, database }]);
         let condition = Condition::new(condition, &decoder).unwrap();
-        Trigger::with_capacity(condition, Window { pre_ns: pre * SECOND, post_ns: post * SECOND }, capacity)
+        Trigger::with_capacity(
+            condition,
+            Window { pre_ns: pre * SECOND, post_ns: post * SECOND, once: false },
+            capacity,
+        )
     }
 
     #[test]
@@ -195,6 +202,15 @@ mod tests {
         let mut frames = trigger("byte[0] >= 10", 0, 1, 100);
         assert_eq!(kept(&mut frames, 0..30), (10..30).collect::<Vec<_>>());
         assert_eq!(frames.counts().events, 20);
+    }
+
+    #[test]
+    fn the_only_event_that_counts_is_over_though_others_follow() {
+        let mut once = trigger("byte[0] >= 10", 2, 3, 100);
+        once.window.once = true;
+        assert_eq!(kept(&mut once, 0..30), [8, 9, 10, 11, 12, 13]);
+        assert_eq!(once.counts().events, 1);
+        assert!(!once.is_open());
     }
 
     #[test]

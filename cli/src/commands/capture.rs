@@ -287,7 +287,8 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
     }
     eprintln!("lost: {}", summary.lost.line());
     if let Some(ppm) = summary.clock_drift_ppm {
-        eprintln!("the device's clock runs {ppm} ppm faster than this computer's");
+        let how = if ppm < 0.0 { "slower" } else { "faster" };
+        eprintln!("the device's clock runs {} ppm {how} than this computer's", ppm.abs());
     }
     Ok(())
 }

@@ -12,7 +12,7 @@ use cantap::trigger::{Trigger, Window};
 use super::model::Recording;
 
 /// What is kept around an event where a condition is given.
-const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000 };
+const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, once: false };
 
 /// What stands between a file's name and the condition on which it is written.
 const IF: &str = " if ";

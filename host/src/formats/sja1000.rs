@@ -1,5 +1,5 @@
-//! The error code capture register of NXP's SJA1000 controller (data sheet, section 6.4.9): the form in which
-//! Vector's and PEAK's files say what kind of bus error it was.
+//! The error code capture register of Philips' SJA1000 controller (product specification of 2000-01-04, section 6.4.9 with
+//! table 21): the form in which Vector's and PEAK's files say what kind of bus error it was.
 
 use cantap_wire::record::BusErrorKind;
 

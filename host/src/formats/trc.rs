@@ -1,4 +1,4 @@
-//! PEAK's TRC, versions 1.0 to 2.1 (document "PEAK CAN TRC File Format" of 2020-07-27): columns of text with
+//! PEAK's TRC, versions 1.0 to 2.1 (document "PEAK CAN TRC File Format", last update 2020-07-27): columns of text with
 //! times relative to a date in the head, lines ended by CR LF.
 //!
 //! What each version can carry differs; what it cannot is counted. Everything that is not a frame is

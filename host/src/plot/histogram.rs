@@ -5,6 +5,9 @@ use std::collections::BTreeMap;
 /// Bins that are kept at most; with more, they become twice as wide.
 const MOST_BINS: usize = 2048;
 
+/// No bar is narrower: most traces have whole microseconds.
+const NARROWEST_NS: i64 = 1000;
+
 /// Share of all intervals that the bars show; what is further out is only counted.
 const SHOWN_SHARE: f64 = 0.998;
 
@@ -60,7 +63,7 @@ impl Histogram {
             return (Vec::new(), 0);
         };
         // Whole multiples of a bin, so that no bar gets more bins than its neighbour.
-        let per_bar = ((last - first) / most.max(1) as i64 + 1).max(1);
+        let per_bar = ((last - first) / most.max(1) as i64 + 1).max(NARROWEST_NS / self.bin_ns).max(1);
         let bar_count = (last - first) / per_bar + 1;
         let mut counts = vec![0; bar_count as usize];
         for (bin, count) in self.counts.range(first..=last) {

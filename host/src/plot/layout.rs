@@ -11,7 +11,9 @@ const LEGEND_HEIGHT: f32 = 24.0;
 const AXIS_HEIGHT: f32 = 48.0;
 const ANALOGUE_HEIGHT: f32 = 200.0;
 const BARS_HEIGHT: f32 = 320.0;
-const LANE_HEIGHT: f32 = 30.0;
+/// A digital signal's lane: its name, and below it its line.
+const LANE_HEIGHT: f32 = 46.0;
+const LANE_NAME_HEIGHT: f32 = 18.0;
 const PANE_DISTANCE: f32 = 16.0;
 /// Text is 13 units high; DejaVu Sans takes about this share of its height per character.
 const TEXT_SIZE: f32 = 13.0;
@@ -70,7 +72,8 @@ fn lay_out_pane(plot: &Plot, pane: &Pane, top: f32, first_curve: usize, scene: &
         Content::Digital(curves) => {
             for (index, curve) in curves.iter().enumerate() {
                 let lane_top = area.top + LANE_HEIGHT * index as f32;
-                let lane = PaneArea { top: lane_top + 5.0, bottom: lane_top + LANE_HEIGHT - 5.0, ..area };
+                entry(scene, (LEFT + 8.0, lane_top + LANE_NAME_HEIGHT - 3.0), curve, first_curve + index);
+                let lane = lane_area(&area, index);
                 let places = Places { area: lane, x: scene.span, y: (0.0, 1.0) };
                 draw_curve(curve, first_curve + index, &places, scene);
             }
@@ -112,28 +115,42 @@ fn legend(pane: &Pane, top: f32, first_curve: usize, scene: &mut Scene) -> f32 {
     if !pane.label.is_empty() {
         text(scene, (LEFT - 10.0, baseline), TEXT_SIZE, Anchor::End, SOFT_INK, &pane.label);
     }
+    if matches!(pane.content, Content::Digital(_)) {
+        // Each lane has its own name.
+        return top + 8.0;
+    }
     for (index, curve) in pane.content.curves().iter().enumerate() {
-        let number = first_curve + index;
         let needed = 24.0 + curve.name.chars().count() as f32 * CHARACTER_WIDTH + 18.0;
         if x > LEFT && x + needed > right {
             x = LEFT;
             baseline += LEGEND_HEIGHT - 4.0;
         }
-        let colour = Colour(colour_of(curve, number), 255);
-        let swatch = vec![(x, baseline - 5.0), (x + 18.0, baseline - 5.0)];
-        line(scene, swatch, colour, 3.0, false, Some(number));
-        scene.shapes.push(Shape::Text {
-            x: x + 24.0,
-            y: baseline,
-            size: TEXT_SIZE,
-            anchor: Anchor::Start,
-            colour: INK,
-            text: curve.name.clone(),
-            curve: Some(number),
-        });
+        entry(scene, (x, baseline), curve, first_curve + index);
         x += needed;
     }
     baseline + 8.0
+}
+
+/// A curve's colour and name.
+fn entry(scene: &mut Scene, (x, baseline): (f32, f32), curve: &Curve, number: usize) {
+    let colour = Colour(colour_of(curve, number), 255);
+    let swatch = vec![(x, baseline - 5.0), (x + 18.0, baseline - 5.0)];
+    line(scene, swatch, colour, 3.0, false, Some(number));
+    scene.shapes.push(Shape::Text {
+        x: x + 24.0,
+        y: baseline,
+        size: TEXT_SIZE,
+        anchor: Anchor::Start,
+        colour: INK,
+        text: curve.name.clone(),
+        curve: Some(number),
+    });
+}
+
+/// Where a digital signal's line is.
+fn lane_area(pane: &PaneArea, lane: usize) -> PaneArea {
+    let top = pane.top + LANE_HEIGHT * lane as f32;
+    PaneArea { top: top + LANE_NAME_HEIGHT + 3.0, bottom: top + LANE_HEIGHT - 5.0, ..*pane }
 }
 
 /// From values to places in a pane.
@@ -208,9 +225,9 @@ fn grid(plot: &Plot, pane: &Pane, places: &Places, scene: &mut Scene) {
             line(scene, vec![(area.left, y), (area.right, y)], GRID, 1.0, false, None);
         }
         for lane in 0..curves.len() {
-            let middle = area.top + LANE_HEIGHT * (lane as f32 + 0.5);
-            for (offset, label) in [(-4.0, "1"), (12.0, "0")] {
-                text(scene, (area.left - 8.0, middle + offset), 11.0, Anchor::End, SOFT_INK, label);
+            let PaneArea { left, top, bottom, .. } = lane_area(&area, lane);
+            for (y, label) in [(top, "1"), (bottom, "0")] {
+                text(scene, (left - 8.0, y + 4.0), 11.0, Anchor::End, SOFT_INK, label);
             }
         }
         return;

@@ -212,9 +212,10 @@ impl Plot {
                 }
             }
             if let Content::Bars(bars) = &pane.content {
+                // A clock's ticks, all alike, are one bar and no wall.
                 for bar in bars {
-                    span.include(bar.from);
-                    span.include(bar.to);
+                    span.include(bar.from - 10.0 * (bar.to - bar.from));
+                    span.include(bar.to + 10.0 * (bar.to - bar.from));
                 }
             }
         }

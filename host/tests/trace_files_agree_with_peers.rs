@@ -22,14 +22,15 @@ fn python() -> String {
     std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned())
 }
 
+fn peers_are_required() -> bool {
+    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
+}
+
 /// A program's output, or `None` after saying that it is missing. One that is there and fails is a failure.
 fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
     let there = Command::new(command.get_program()).args(probe).output();
     if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
-        assert!(
-            std::env::var_os("CANTAP_REQUIRE_PEERS").is_none_or(|value| value != "1"),
-            "{peer} is required and does not run"
-        );
+        assert!(!peers_are_required(), "{peer} is required and does not run");
         eprintln!("SKIPPED: {peer} is not installed, so nothing was compared with it");
         return None;
     }
@@ -68,12 +69,31 @@ struct Carries {
     direction: bool,
     /// Whether a remote frame keeps its length.
     remote_length: bool,
+    /// What else than frames python-can gets.
+    events: Events,
     /// Subtracted from all times.
     from_us: i64,
 }
 
-const EVERYTHING: Carries =
-    Carries { step_us: 1, channel: None, direction: true, remote_length: true, from_us: 0 };
+/// Which events come as error frames.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Events {
+    /// None: its reader passes over them.
+    None,
+    /// Bus errors; states and losses have forms that it passes over.
+    BusErrors,
+    /// All, as SocketCAN's error frames, and without their channel.
+    All,
+}
+
+const EVERYTHING: Carries = Carries {
+    step_us: 1,
+    channel: None,
+    direction: true,
+    remote_length: true,
+    events: Events::BusErrors,
+    from_us: 0,
+};
 
 /// A record as the script prints it; `None` for what python-can has no message for.
 fn line(record: &TraceRecord, carries: Carries) -> Option<String> {
@@ -83,8 +103,12 @@ fn line(record: &TraceRecord, carries: Carries) -> Option<String> {
     let channel = carries.channel.unwrap_or(record.channel);
     let (frame, direction) = match &record.event {
         TraceEvent::Frame { frame, direction, .. } => (frame, *direction),
-        TraceEvent::BusError { .. } => return Some(format!("{micros} {channel} Rx error")),
-        _ => return None,
+        event => {
+            let is_bus_error = matches!(event, TraceEvent::BusError { .. });
+            let comes = carries.events == Events::All || is_bus_error && carries.events == Events::BusErrors;
+            let channel = if carries.events == Events::All { 0 } else { channel };
+            return comes.then(|| format!("{micros} {channel} Rx error"));
+        }
     };
     let direction = if direction == Direction::Tx && carries.direction { "Tx" } else { "Rx" };
     let kind = if frame.is_remote() { "remote" } else { "data" };
@@ -101,11 +125,11 @@ fn lines(records: &[TraceRecord], carries: Carries) -> Vec<String> {
     records.iter().filter_map(|record| line(record, carries)).collect()
 }
 
-/// Real traffic, and frames of every kind behind it.
-fn frames_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
+/// Real traffic, and records of every kind behind it.
+fn records_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
     let mut records = real(1000);
     let last_ns = records.last().unwrap().time_ns;
-    let odd = frames(&odd(directory));
+    let odd = odd(directory);
     let first_ns = odd[0].time_ns;
     records.extend(odd.iter().map(|record| TraceRecord {
         time_ns: record.time_ns - first_ns + last_ns + 1_000_000_000,
@@ -114,18 +138,27 @@ fn frames_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
     records
 }
 
+/// Only the frames among them.
+fn frames_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
+    frames(&records_of_every_kind(directory))
+}
+
 /// What python-can's readers can give back of each format.
 fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
     let version = |version, step_us, channel, direction| {
         // It does not read the date in the head of version 1.0.
         let from_us = if version == TrcVersion::V1_0 { start_us / step_us * step_us } else { 0 };
-        (Format::Trc(version), Carries { step_us, channel, direction, from_us, ..EVERYTHING })
+        let events = Events::None;
+        (Format::Trc(version), Carries { step_us, channel, direction, events, from_us, ..EVERYTHING })
     };
     vec![
-        (Format::Candump, EVERYTHING),
+        (Format::Candump, Carries { events: Events::All, ..EVERYTHING }),
         (Format::Asc, EVERYTHING),
         (Format::Blf, EVERYTHING),
-        (Format::Csv(CsvDialect::PythonCan), Carries { channel: Some(0), direction: false, ..EVERYTHING }),
+        (
+            Format::Csv(CsvDialect::PythonCan),
+            Carries { channel: Some(0), direction: false, events: Events::All, ..EVERYTHING },
+        ),
         version(TrcVersion::V2_1, 1, None, true),
         version(TrcVersion::V2_0, 1, Some(1), true),
         version(TrcVersion::V1_3, 1, None, true),
@@ -135,9 +168,9 @@ fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
 }
 
 #[test]
-fn python_can_reads_every_frame_of_the_files_we_write() {
+fn python_can_reads_every_record_of_the_files_we_write() {
     let directory = directory("python_can_reads");
-    let records = frames_of_every_kind(&directory);
+    let records = records_of_every_kind(&directory);
     let formats = python_can_formats(records[0].time_ns / 1000);
     let paths: Vec<_> = formats.iter().map(|(format, _)| directory.join(file_name(*format, ""))).collect();
     for ((format, _), path) in formats.iter().zip(&paths) {
@@ -154,9 +187,9 @@ fn python_can_reads_every_frame_of_the_files_we_write() {
 }
 
 #[test]
-fn we_read_every_frame_of_the_files_that_python_can_writes() {
+fn we_read_every_message_of_the_files_that_python_can_writes() {
     let directory = directory("python_can_writes");
-    let records = frames_of_every_kind(&directory);
+    let records = records_of_every_kind(&directory);
     let source = directory.join("messages.txt");
     fs::write(&source, lines(&records, EVERYTHING).join("\n")).unwrap();
     let table = Carries { channel: Some(1), direction: false, ..EVERYTHING };
@@ -186,7 +219,7 @@ fn we_read_every_frame_of_the_files_that_python_can_writes() {
         };
         if *name == "a.trc" {
             // It writes none into PEAK's files, and says so in a warning.
-            expected.retain(|line| !line.contains(" remote "));
+            expected.retain(|line| !line.contains(" remote ") && !line.ends_with(" error"));
         }
         for (at, (ours, expected)) in ours.iter().zip(&expected).enumerate() {
             assert_eq!(ours, expected, "{name}, message {at}");
@@ -196,36 +229,49 @@ fn we_read_every_frame_of_the_files_that_python_can_writes() {
 }
 
 #[test]
-fn wireshark_reads_every_packet_of_the_pcapng_files_we_write() {
+fn wireshark_and_we_read_each_others_pcapng_files() {
     let directory = directory("wireshark");
-    let mut records = frames_of_every_kind(&directory);
+    let mut records = records_of_every_kind(&directory);
     for record in &mut records {
         record.time_ns += 7;
     }
-    let path = directory.join("a.pcapng");
-    write(&path, Format::Pcapng, &records);
-    let fields = ["frame.time_epoch", "frame.interface_name", "can.id", "can.flags.xtd", "can.flags.rtr"];
+    let (ours, theirs) = (directory.join("ours.pcapng"), directory.join("theirs.pcapng"));
+    write(&ours, Format::Pcapng, &records);
+    let fields =
+        ["frame.time_epoch", "frame.interface_name", "can.flags.err", "can.flags.xtd", "can.flags.rtr"];
     let mut command = Command::new("tshark");
-    command.arg("-r").arg(&path).args(["-T", "fields", "-E", "separator=/s"]);
-    for field in fields.iter().chain(&["can.len"]) {
+    command.arg("-r").arg(&ours).args(["-T", "fields", "-E", "separator=/s"]);
+    for field in fields.iter().chain(&["can.len", "can.id"]) {
         command.args(["-e", field]);
     }
     let Some(text) = run("tshark", &["--version"], &mut command) else { return };
     let flag = |flag| if flag { "(1|True)" } else { "(0|False)" };
-    let expected = records.iter().map(|record| {
-        let frame = record.frame().unwrap();
-        let (seconds, nanos) = (record.time_ns / 1_000_000_000, record.time_ns % 1_000_000_000);
-        let (channel, id) = (record.channel - 1, frame.id());
-        let flags = (flag(id.is_extended()), flag(frame.is_remote()));
-        (format!("{seconds}.{nanos:09} can{channel} {} ", id.raw()), flags, frame.dlc())
-    });
     assert_eq!(text.lines().count(), records.len());
-    for (line, (start, (extended, remote), dlc)) in text.lines().zip(expected) {
+    for (line, record) in text.lines().zip(&records) {
+        let (seconds, nanos) = (record.time_ns / 1_000_000_000, record.time_ns % 1_000_000_000);
+        let start = format!("{seconds}.{nanos:09} can{} ", record.channel - 1);
         let rest =
             line.strip_prefix(&start).unwrap_or_else(|| panic!("'{line}' does not begin with '{start}'"));
         let words: Vec<_> = rest.split(' ').collect();
-        assert!(words.len() == 3 && extended.contains(words[0]) && remote.contains(words[1]), "{line}");
-        assert_eq!(words[2], dlc.to_string(), "{line}");
+        assert!(flag(record.frame().is_none()).contains(words[0]), "{line}");
+        let Some(frame) = record.frame() else { continue };
+        let (extended, remote) = (flag(frame.id().is_extended()), flag(frame.is_remote()));
+        assert!(words.len() == 5 && extended.contains(words[1]) && remote.contains(words[2]), "{line}");
+        assert_eq!(words[3..], [frame.dlc().to_string(), frame.id().raw().to_string()], "{line}");
+    }
+    // What it writes has the same packets in blocks of its own making, gzip included.
+    for (name, compress) in [("theirs.pcapng", "none"), ("theirs.pcapng.gz", "gzip")] {
+        let path = theirs.with_file_name(name);
+        let mut command = Command::new("tshark");
+        command.arg("-r").arg(&ours).args(["-F", "pcapng", "-w"]).arg(&theirs);
+        run("tshark", &["--version"], &mut command);
+        if compress == "gzip" {
+            let packed = Command::new("gzip").args(["-kf"]).arg(&theirs).status();
+            assert!(packed.unwrap().success());
+        }
+        let (read, issues) = read(&path);
+        assert_eq!(issues, Vec::<String>::new(), "{name}");
+        assert!(read == records, "{name}: {} of {}", read.len(), records.len());
     }
 }
 
@@ -250,6 +296,15 @@ fn can_utils_and_we_read_each_others_logs_and_asc_files() {
     let mut asc2log = Command::new("asc2log");
     asc2log.arg("-I").arg(at("ours.asc")).arg("-O").arg(at("theirs.log"));
     run("asc2log (can-utils)", &[], &mut asc2log);
+    // It prints each line of a log, error frames with what they say.
+    let every = records_of_every_kind(&directory);
+    write(&at("every.log"), Format::Candump, &every);
+    let mut log2long = Command::new("log2long");
+    log2long.stdin(fs::File::open(at("every.log")).unwrap());
+    let text = run("log2long (can-utils)", &[], &mut log2long).unwrap();
+    assert_eq!(text.lines().filter(|line| line.starts_with('(')).count(), every.len(), "{text}");
+    let errors = every.iter().filter(|record| record.frame().is_none()).count();
+    assert_eq!(text.matches("ERRORFRAME").count(), errors, "{text}");
     for name in ["theirs.asc", "theirs.log"] {
         let (read, issues) = read(at(name));
         assert_eq!(issues, Vec::<String>::new(), "{name}");
@@ -280,6 +335,7 @@ fn python_can_test_data() -> Option<PathBuf> {
             .arg(&directory)
             .output();
         if !fetched.is_ok_and(|output| output.status.success()) {
+            assert!(!peers_are_required(), "python-can's source is required and could not be fetched");
             eprintln!("SKIPPED: python-can's source could not be fetched, so its test files were not read");
             return None;
         }

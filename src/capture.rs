@@ -116,29 +116,53 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// The transmit interrupt: a mailbox has finished.
-    pub fn on_transmit<C: Clock>(
+    /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else.
+    pub fn on_transmit<T: Traffic, C: Clock>(
         &mut self,
         channel: Channel,
-        traffic: &mut impl Traffic,
+        traffic: &mut [T; CHANNELS],
         clock: &C,
         entered: u32,
     ) {
-        let now = self.recorder.time(entered);
+        let ended = self.recorder.time(entered);
         let state = &mut self.channels[channel.index()];
-        state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
-        // On a busy bus the next frame is due at once: leaving for the alarm would cost more time than there is.
+        state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason);
+        // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
+        // than there is.
         let now = self.recorder.time(clock.now());
-        if let Some(due) = state.transmitter.next_due()
-            && due <= now + u64::from(C::ALARM_EARLY_TICKS)
-        {
-            if due > now {
-                clock.wait_until(due as u32);
-            }
-            let now = self.recorder.time(clock.now());
-            state.transmitter.service(traffic, &mut self.recorder, now);
+        state.transmitter.load_due(&mut traffic[channel.index()], now);
+        self.load_in_time(traffic, clock);
+        let state = &mut self.channels[channel.index()];
+        let recorded = state.transmitter.record(&mut self.recorder, ended);
+        let now = self.recorder.time(clock.now());
+        if !recorded || state.transmitter.has_more(now) {
+            state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
         }
         self.arm(clock);
+    }
+
+    /// Waits for what is due so soon that the alarm would come too late for it, on either channel, and sends it.
+    fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
+        loop {
+            let mut now = self.recorder.time(clock.now());
+            let Some(due) = self.next_queued().filter(|due| *due <= now + u64::from(C::ALARM_EARLY_TICKS))
+            else {
+                return;
+            };
+            if due > now {
+                clock.wait_until(due as u32);
+                now = self.recorder.time(clock.now());
+            }
+            let mut any = false;
+            for (state, traffic) in self.channels.iter_mut().zip(traffic.iter_mut()) {
+                if state.open.is_some() {
+                    any |= state.transmitter.load_due(traffic, now);
+                }
+            }
+            if !any {
+                return;
+            }
+        }
     }
 
     /// The error interrupt.
@@ -151,6 +175,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// The alarm: something is due for transmission.
     pub fn on_alarm<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
+        self.load_in_time(traffic, clock);
         let mut now = self.recorder.time(clock.now());
         if let Some(due) = self.next_due()
             && due.saturating_sub(now) <= u64::from(C::ALARM_EARLY_TICKS)
@@ -169,21 +194,25 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// Once a millisecond: keeps time going, reads what no interrupt tells, retries what found no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+        for channel in Channel::ALL {
+            self.on_channel_tick(channel, &mut traffic[channel.index()], clock);
+        }
+    }
+
+    /// One channel's part of [`Self::on_tick`], for where the alarm must be able to come between the two.
+    pub fn on_channel_tick(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
         let now = self.recorder.time(clock.now());
-        let mut any_open = false;
-        for (state, traffic) in self.channels.iter_mut().zip(traffic) {
-            if state.open.is_some() {
-                any_open = true;
-                state.errors.update(traffic, &mut self.recorder, now);
-                state.errors.tick(&mut self.recorder, now);
-                Self::give_up_when_off(state, traffic, &mut self.recorder, now);
-                state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
-            }
+        let state = &mut self.channels[channel.index()];
+        if state.open.is_none() {
+            return;
         }
-        if any_open {
-            self.recorder.tick(now);
-            self.arm(clock);
-        }
+        state.errors.update(traffic, &mut self.recorder, now);
+        state.errors.tick(&mut self.recorder, now);
+        Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+        // Mailboxes that finish meanwhile are left to the interrupt, which knows when.
+        state.transmitter.service(traffic, &mut self.recorder, now);
+        self.recorder.tick(now);
+        self.arm(clock);
     }
 
     /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame.
@@ -199,6 +228,12 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.transmitter.drop_all(TransmitFailure::BusOff, traffic);
             state.transmitter.on_finished(traffic, recorder, now, state.abort_reason);
         }
+    }
+
+    /// When a frame of a queue is due next.
+    fn next_queued(&self) -> Option<u64> {
+        let open = self.channels.iter().filter(|state| state.open.is_some());
+        open.filter_map(|state| state.transmitter.next_queued()).min()
     }
 
     /// When something is due for transmission next.

@@ -2,8 +2,8 @@
 //!
 //! | priority | tasks | why |
 //! |---|---|---|
-//! | 5 | both channels' receive interrupts: the stamp, and nothing else | a late stamp is a wrong one |
-//! | 4 | draining both FIFOs, transmit and error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
+//! | 5 | both channels' receive and transmit interrupts: the stamp, and nothing else | a late stamp is a wrong one |
+//! | 4 | draining both FIFOs, confirming, error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
 //! | 2 | USB, the millisecond tick | a host can be told to wait |
 //! | – | idle | sleeps |
 //!
@@ -38,7 +38,7 @@ mod app {
     use stm32f4xx_hal::pac::Interrupt;
 
     use crate::hw::access::{Access, Controls, Tap};
-    use crate::hw::can::Doorbell;
+    use crate::hw::can::{Doorbell, TransmitBell};
     use crate::hw::stamp::StampTimer;
     use crate::hw::tick::Tick;
     use crate::hw::usb::{Memory, UsbPort};
@@ -53,6 +53,10 @@ mod app {
         can1_entered: AtomicU32,
         /// When the interrupt stamped CAN2's last frame.
         can2_entered: AtomicU32,
+        /// When the interrupt stamped CAN1's last transmission.
+        can1_sent_at: AtomicU32,
+        /// When the interrupt stamped CAN2's last transmission.
+        can2_sent_at: AtomicU32,
         /// Only at priority 2.
         #[lock_free]
         session: Session<'static>,
@@ -72,6 +76,10 @@ mod app {
         can2_clock: StampTimer,
         can1_doorbell: Doorbell,
         can2_doorbell: Doorbell,
+        can1_tx_bell: TransmitBell,
+        can2_tx_bell: TransmitBell,
+        can1_tx_reopener: TransmitBell,
+        can2_tx_reopener: TransmitBell,
         can1_reopener: Doorbell,
         can2_reopener: Doorbell,
         can1_tx_clock: StampTimer,
@@ -89,6 +97,8 @@ mod app {
         chip.tick(Activity { error: restarted_after_failure, ..Activity::default() });
         let [can1_doorbell, can2_doorbell] = can.doorbells;
         let [can1_reopener, can2_reopener] = can.reopeners;
+        let [can1_tx_bell, can2_tx_bell] = can.transmit_bells;
+        let [can1_tx_reopener, can2_tx_reopener] = can.transmit_reopeners;
         let mut filters = can.filters;
         filters.write(&Layout::open());
         let (producer, consumer) = cx.local.records.split();
@@ -97,6 +107,8 @@ mod app {
                 tap: Tap { capture: Capture::new(producer), traffic: can.traffic, stamp },
                 can1_entered: AtomicU32::new(0),
                 can2_entered: AtomicU32::new(0),
+                can1_sent_at: AtomicU32::new(0),
+                can2_sent_at: AtomicU32::new(0),
                 session: Session::new(consumer, identity),
                 usb,
                 controls: Controls { can: can.control, filters, chip, stamp },
@@ -108,6 +120,10 @@ mod app {
                 can2_clock: stamp,
                 can1_doorbell,
                 can2_doorbell,
+                can1_tx_bell,
+                can2_tx_bell,
+                can1_tx_reopener,
+                can2_tx_reopener,
                 can1_reopener,
                 can2_reopener,
                 can1_tx_clock: stamp,
@@ -161,25 +177,45 @@ mod app {
         cx.local.can2_reopener.open();
     }
 
-    /// Confirms what CAN1 has sent and fills its mailboxes again.
+    /// Stamps the end of a transmission on CAN1, and leaves the mailbox to [`can1_sent`].
     ///
-    /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
-    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
-    #[task(binds = CAN1_TX, priority = 4, local = [can1_tx_clock], shared = [tap])]
-    fn can1_tx(mut cx: can1_tx::Context) {
-        let entered = cx.local.can1_tx_clock.now();
-        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], stamp }| {
-            capture.on_transmit(Channel::Can1, can1, stamp, entered);
-        });
+    /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp is as good as a frame's.
+    #[task(binds = CAN1_TX, priority = 5, local = [can1_tx_clock, can1_tx_bell], shared = [&can1_sent_at])]
+    fn can1_tx(cx: can1_tx::Context) {
+        cx.shared.can1_sent_at.store(cx.local.can1_tx_clock.now(), Ordering::Relaxed);
+        cx.local.can1_tx_bell.silence();
+        rtic::pend(Interrupt::USART2);
     }
 
     /// As [`can1_tx`], for CAN2.
-    #[task(binds = CAN2_TX, priority = 4, local = [can2_tx_clock], shared = [tap])]
-    fn can2_tx(mut cx: can2_tx::Context) {
-        let entered = cx.local.can2_tx_clock.now();
-        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
-            capture.on_transmit(Channel::Can2, can2, stamp, entered);
+    #[task(binds = CAN2_TX, priority = 5, local = [can2_tx_clock, can2_tx_bell], shared = [&can2_sent_at])]
+    fn can2_tx(cx: can2_tx::Context) {
+        cx.shared.can2_sent_at.store(cx.local.can2_tx_clock.now(), Ordering::Relaxed);
+        cx.local.can2_tx_bell.silence();
+        rtic::pend(Interrupt::USART3);
+    }
+
+    /// Fills CAN1's mailboxes again and confirms what was sent. USART2 is not used, and its interrupt raises this task.
+    ///
+    /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
+    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
+    #[task(binds = USART2, priority = 4, local = [can1_tx_reopener], shared = [tap, &can1_sent_at])]
+    fn can1_sent(mut cx: can1_sent::Context) {
+        let entered = cx.shared.can1_sent_at.load(Ordering::Relaxed);
+        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| {
+            capture.on_transmit(Channel::Can1, traffic, stamp, entered);
         });
+        cx.local.can1_tx_reopener.open();
+    }
+
+    /// As [`can1_sent`], for CAN2, with USART3.
+    #[task(binds = USART3, priority = 4, local = [can2_tx_reopener], shared = [tap, &can2_sent_at])]
+    fn can2_sent(mut cx: can2_sent::Context) {
+        let entered = cx.shared.can2_sent_at.load(Ordering::Relaxed);
+        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| {
+            capture.on_transmit(Channel::Can2, traffic, stamp, entered);
+        });
+        cx.local.can2_tx_reopener.open();
     }
 
     /// Records CAN1's errors and changes of state.
@@ -232,10 +268,13 @@ mod app {
         let tim7::SharedResources { mut tap, session, usb, controls, .. } = cx.shared;
         cx.local.tick.acknowledge();
         cx.local.watchdog.feed();
-        let activity = tap.lock(|Tap { capture, traffic, stamp }| {
-            capture.on_tick(traffic, stamp);
-            capture.take_activity()
-        });
+        // One short lock each, so that the transmission alarm can come between them.
+        for channel in Channel::ALL {
+            tap.lock(|Tap { capture, traffic, stamp }| {
+                capture.on_channel_tick(channel, &mut traffic[channel.index()], stamp);
+            });
+        }
+        let activity = tap.lock(|Tap { capture, .. }| capture.take_activity());
         controls.chip.tick(activity);
         session.poll(usb, &mut Access { tap, controls });
     }

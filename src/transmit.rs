@@ -70,9 +70,9 @@ pub struct Transmitter {
     triggers_armed: bool,
     replies_waiting: u8,
     random: u32,
-    /// Finished records that found no room in the queue would break "each one is confirmed", so
-    /// nothing more is sent until they are written.
-    unconfirmed: Deque<Event, MAILBOXES>,
+    /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
+    /// is sent until it is written; what was in the mailboxes by then has room here too.
+    unconfirmed: Deque<Event, { 2 * MAILBOXES }>,
     /// The queue is being given up, as fast as its records find room.
     dropping: Option<TransmitFailure>,
     sent: u32,
@@ -236,6 +236,13 @@ impl Transmitter {
         now: u64,
         reason: TransmitFailure,
     ) {
+        self.collect(traffic, reason);
+        self.service(traffic, recorder, now);
+    }
+
+    /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::load_due`] may follow before
+    /// [`Self::record`], so that a busy bus need not wait for the record.
+    pub fn collect(&mut self, traffic: &mut impl Traffic, reason: TransmitFailure) {
         while !self.unconfirmed.is_full() {
             let Some((mailbox, outcome)) = traffic.take_finished() else { break };
             let Some((tag, frame)) = self.mailboxes.get_mut(mailbox as usize).and_then(Option::take) else {
@@ -251,12 +258,46 @@ impl Transmitter {
             };
             let counter = if outcome == Outcome::Sent { &mut self.sent } else { &mut self.failed };
             *counter = counter.wrapping_add(1);
-            if !recorder.event(&event, now) {
-                // Cannot fail: checked above.
-                let _ = self.unconfirmed.push_back(event);
-            }
+            // Cannot fail: checked above.
+            let _ = self.unconfirmed.push_back(event);
         }
-        self.service(traffic, recorder, now);
+    }
+
+    /// Whether something other than the queue's frames is waiting, for [`Self::service`].
+    pub fn has_more(&self, now: u64) -> bool {
+        let waiting = self.replies_waiting > 0 || self.periodic_waiting > 0 || self.dropping.is_some();
+        waiting || now >= self.periodic_due.max(self.look_from)
+    }
+
+    /// Fills free mailboxes with the queue's frames that are due, unless something else goes first. Returns whether there
+    /// was one.
+    #[inline]
+    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) -> bool {
+        let mut any = false;
+        if self.has_more(now) {
+            return any;
+        }
+        while let Some(&Queued { tag, frame, at }) = self.queue.front() {
+            // Whatever is in a mailbox must find room to be kept when it has finished.
+            let kept = self.unconfirmed.len() + self.mailboxes.iter().flatten().count();
+            if at > now || kept >= self.unconfirmed.capacity() || !self.load(tag, &frame, traffic) {
+                break;
+            }
+            self.queue.pop_front();
+            any = true;
+        }
+        any
+    }
+
+    /// Records what has finished, at `ended`; false if the queue has no room for all of it.
+    pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, ended: u64) -> bool {
+        while let Some(event) = self.unconfirmed.front() {
+            if !recorder.event(event, ended) {
+                return false;
+            }
+            self.unconfirmed.pop_front();
+        }
+        true
     }
 
     /// Fills free mailboxes with what is due.
@@ -266,11 +307,8 @@ impl Transmitter {
         recorder: &mut Recorder<'_, N>,
         now: u64,
     ) {
-        while let Some(event) = self.unconfirmed.front() {
-            if !recorder.event(event, now) {
-                return;
-            }
-            self.unconfirmed.pop_front();
+        if !self.record(recorder, now) {
+            return;
         }
         if let Some(reason) = self.dropping {
             while let Some(&Queued { tag, .. }) = self.queue.front() {
@@ -295,20 +333,23 @@ impl Transmitter {
                 return;
             }
         }
-        while let Some(&Queued { tag, frame, at }) = self.queue.front() {
-            if at > now || !self.load(tag, &frame, traffic) {
-                return;
-            }
-            self.queue.pop_front();
-        }
+        self.load_due(traffic, now);
+    }
+
+    /// When the queue's head is due, if it has a time and a mailbox is free: one that is due waits for a mailbox, not for time.
+    pub fn next_queued(&self) -> Option<u64> {
+        let head = self.queue.front().map(|queued| queued.at)?;
+        (head != 0 && self.mailboxes.iter().any(Option::is_none)).then_some(head)
     }
 
     /// The next time at which [`Self::service`] has something to do that no interrupt of the controller tells.
     pub fn next_due(&self) -> Option<u64> {
-        let head = self.queue.front().map_or(NEVER, |queued| queued.at);
-        // A head that is due waits for a mailbox, not for time.
-        let head = if head == 0 || self.mailboxes.iter().all(Option::is_some) { NEVER } else { head };
-        let due = head.min(self.periodic_due.max(self.look_from));
+        // What waits for room in the record queue is tried again every millisecond; an alarm would come again and again and
+        // keep USB, which makes the room, from running.
+        if !self.unconfirmed.is_empty() || self.dropping.is_some() {
+            return None;
+        }
+        let due = self.next_queued().unwrap_or(NEVER).min(self.periodic_due.max(self.look_from));
         (due != NEVER).then_some(due)
     }
 

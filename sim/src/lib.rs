@@ -24,6 +24,7 @@ pub mod rig;
 pub mod run;
 pub mod soc;
 pub mod stop;
+pub mod stream;
 pub mod trace;
 pub mod traffic;
 pub mod usb;

@@ -87,6 +87,10 @@ pub struct Rig {
     between_sessions: bool,
     events: Vec<(u64, Event)>,
     last_bytes_at: u64,
+    /// Places in each channel's transmit queue, once the device has said.
+    tx_queue: usize,
+    /// What crossed the buses, if it is kept.
+    watched: Option<[Vec<BusFrame>; CHANNELS]>,
     /// Bits of frames on each bus, with intermission, as long as it was booked.
     bus_bits: [u64; CHANNELS],
     recording: Option<Vec<u8>>,
@@ -107,6 +111,8 @@ impl Rig {
             between_sessions: false,
             events: Vec::new(),
             last_bytes_at: 0,
+            tx_queue: 0,
+            watched: None,
             bus_bits: [0; CHANNELS],
             recording: None,
         }
@@ -168,8 +174,12 @@ impl Rig {
     /// Moves the buses' histories into the books and the host's bytes into the session.
     fn exchange(&mut self) {
         let mut board = self.machine.board();
-        for wire in &mut board.wires {
-            for crossed in wire.take_history() {
+        for (number, wire) in board.wires.iter_mut().enumerate() {
+            let history = wire.take_history();
+            if let Some(watched) = &mut self.watched {
+                watched[number].extend(&history);
+            }
+            for crossed in history {
                 let bits = u64::from(crate::bus::bits::bus_bits(&crossed.frame));
                 for channel in Channel::ALL {
                     let n = channel.index();
@@ -238,6 +248,7 @@ impl Rig {
             return Err(wrong("Hello", &reply));
         };
         self.between_sessions = false;
+        self.tx_queue = hello.tx_queue.into();
         self.follow_clock(hello.tick_hz);
         Ok(hello)
     }
@@ -250,8 +261,7 @@ impl Rig {
 
     /// Tells the ledger how the device's clock stands, taken from the stamp timer itself.
     fn follow_clock(&mut self, tick_hz: u32) {
-        let now = self.now();
-        let origin = self.machine.board().stamp_timer_origin(now);
+        let origin = self.clock_origin();
         self.ledger.set_clock(origin, CYCLES_PER_SECOND / u64::from(tick_hz));
     }
 
@@ -374,6 +384,27 @@ impl Rig {
     /// Keeps the bytes that the device sends from now on.
     pub fn record_bytes(&mut self) {
         self.recording = Some(Vec::new());
+    }
+
+    /// Keeps what crosses the buses from now on.
+    pub fn watch(&mut self) {
+        self.watched = Some(Default::default());
+    }
+
+    /// What crossed each bus since [`Self::watch`], which ends.
+    pub fn take_watched(&mut self) -> [Vec<BusFrame>; CHANNELS] {
+        self.watched.take().unwrap_or_default()
+    }
+
+    /// Places in each channel's transmit queue.
+    pub fn tx_queue(&self) -> usize {
+        self.tx_queue
+    }
+
+    /// The core cycle of the device's tick 0.
+    pub fn clock_origin(&mut self) -> u64 {
+        let now = self.now();
+        self.machine.board().stamp_timer_origin(now)
     }
 
     /// The bytes kept so far.

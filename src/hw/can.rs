@@ -36,6 +36,10 @@ pub struct Controllers {
     pub doorbells: [Doorbell; CHANNELS],
     /// For the tasks that drain, one each.
     pub reopeners: [Doorbell; CHANNELS],
+    /// For the interrupts that stamp transmissions, one each.
+    pub transmit_bells: [TransmitBell; CHANNELS],
+    /// For the tasks that confirm, one each.
+    pub transmit_reopeners: [TransmitBell; CHANNELS],
 }
 
 impl Controllers {
@@ -55,9 +59,16 @@ impl Controllers {
             filters: CanFilters { can1: Registers(CAN1::ptr()) },
             doorbells: blocks.map(|can| Doorbell { can }),
             reopeners: blocks.map(|can| Doorbell { can }),
+            transmit_bells: blocks.map(|can| TransmitBell { can }),
+            transmit_reopeners: blocks.map(|can| TransmitBell { can }),
         }
     }
 }
+
+/// Bits of IER: transmit mailbox empty, FIFO 0 message pending, FIFO 0 overrun (RM0090, CAN_IER).
+const TMEIE: usize = 0;
+const FMPIE0: usize = 1;
+const FOVIE0: usize = 3;
 
 /// A controller's registers.
 #[derive(Clone, Copy)]
@@ -66,6 +77,20 @@ struct Registers(*const RegisterBlock);
 // SAFETY: the registers are there for the whole program, wherever it touches them from. What the halves that hold
 // copies of the pointer write is disjoint, as their docs say.
 unsafe impl Send for Registers {}
+
+impl Registers {
+    /// Sets or clears one bit of IER, leaving the others as they are at that moment (Cortex-M4 technical reference manual,
+    /// "Bit-banding"): an interrupt between reading and writing a whole register would be undone.
+    #[inline]
+    fn set_ier_bit(&self, bit: usize, on: bool) {
+        const PERIPHERALS: usize = 0x4000_0000;
+        const ALIAS: usize = 0x4200_0000;
+        let register = self.ier().as_ptr() as usize;
+        let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
+        // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
+        unsafe { alias.write_volatile(u32::from(on)) };
+    }
+}
 
 impl Deref for Registers {
     type Target = RegisterBlock;
@@ -78,8 +103,9 @@ impl Deref for Registers {
 }
 
 /// The switch of a controller's receive interrupt. The interrupt silences it and leaves the FIFO to a task of lower
-/// priority, which switches it on again when the FIFO is empty. So between the two only one of them ever runs, and
-/// IER, which commands write only while the controller is off the bus, has one writer at a time.
+/// priority, which switches it on again when the FIFO is empty. [`TransmitBell`] is another switch in the same register, at
+/// other moments: so each changes its bits through the bit-band alias, one at a time and untorn. Commands write the
+/// register only while the controller is off the bus.
 pub struct Doorbell {
     can: Registers,
 }
@@ -88,7 +114,8 @@ impl Doorbell {
     /// Ends the interrupt though frames are waiting.
     #[inline]
     pub fn silence(&self) {
-        self.can.ier().modify(|_, w| w.fmpie0().clear_bit().fovie0().clear_bit());
+        self.can.set_ier_bit(FMPIE0, false);
+        self.can.set_ier_bit(FOVIE0, false);
         // Read back, so that the line has fallen before the interrupt returns.
         self.can.ier().read();
     }
@@ -96,7 +123,30 @@ impl Doorbell {
     /// Interrupts again: at once if a frame is waiting.
     #[inline]
     pub fn open(&self) {
-        self.can.ier().modify(|_, w| w.fmpie0().set_bit().fovie0().set_bit());
+        self.can.set_ier_bit(FOVIE0, true);
+        self.can.set_ier_bit(FMPIE0, true);
+    }
+}
+
+/// The switch of a controller's transmit interrupt, as [`Doorbell`] is the receive interrupt's: off from the stamp until
+/// the mailboxes have been looked after.
+pub struct TransmitBell {
+    can: Registers,
+}
+
+impl TransmitBell {
+    /// Ends the interrupt though a mailbox has finished.
+    #[inline]
+    pub fn silence(&self) {
+        self.can.set_ier_bit(TMEIE, false);
+        // Read back, so that the line has fallen before the interrupt returns.
+        self.can.ier().read();
+    }
+
+    /// Interrupts again: at once if a mailbox has finished.
+    #[inline]
+    pub fn open(&self) {
+        self.can.set_ier_bit(TMEIE, true);
     }
 }
 

@@ -52,9 +52,9 @@ impl StampTimer {
 }
 
 impl Clock for StampTimer {
-    /// 6 µs: longer than the other handlers of the alarm's priority take for a frame, and the USB driver masks
-    /// interrupts. Stamps are taken at a higher priority and do not wait; draining the FIFOs has 144 µs.
-    const ALARM_EARLY_TICKS: u32 = 6 * TICKS_PER_US;
+    /// 10 µs: longer than the other handlers of the alarm's priority take for a frame, and any lock. Stamps are taken at a higher
+    /// priority and do not wait; draining the FIFOs has 141 µs.
+    const ALARM_EARLY_TICKS: u32 = 10 * TICKS_PER_US;
 
     #[inline]
     fn wait_until(&self, at: u32) {

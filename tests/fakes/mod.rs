@@ -380,9 +380,20 @@ impl<'q, const N: usize> Bench<'q, N> {
         }
     }
 
-    /// A millisecond passes.
+    /// The transmit interrupt.
+    fn transmit_interrupt(&mut self, channel: Channel) {
+        let entered = self.board.clock.now();
+        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, entered);
+    }
+
+    /// A millisecond passes. Mailboxes that were given up have reported that meanwhile.
     pub fn millisecond(&mut self) {
         self.pass(cantap_firmware::TICKS_PER_MS);
+        for channel in Channel::ALL {
+            if !self.board.traffic[channel.index()].finished.is_empty() {
+                self.transmit_interrupt(channel);
+            }
+        }
         self.board.capture.on_tick(&mut self.board.traffic, &self.board.clock);
         self.poll();
     }
@@ -408,9 +419,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// The bus takes one frame, and the interrupt confirms it.
     pub fn send_one(&mut self, channel: Channel) -> Option<Frame> {
         let sent = self.board.traffic[channel.index()].send_one();
-        let entered = self.board.clock.now();
-        let traffic = &mut self.board.traffic[channel.index()];
-        self.board.capture.on_transmit(channel, traffic, &self.board.clock, entered);
+        self.transmit_interrupt(channel);
         sent
     }
 

@@ -1,0 +1,97 @@
+//! What a host streams for transmission through the firmware's ELF: in order, at its times, filling the bus, confirmed one by
+//! one, and at no cost to what the other channel captures.
+
+mod common;
+
+use cantap_sim::machine::Setup;
+use cantap_sim::rig::{MS, Rig};
+use cantap_sim::stream::{Replayed, fill, join, replay};
+use cantap_sim::traffic::{Kind, Traffic};
+use cantap_sim::usb_host::Timing;
+use cantap_wire::Channel;
+use cantap_wire::Channel::{Can1, Can2};
+
+const MEGABIT: u32 = 1_000_000;
+
+/// A board that takes part in the buses of `channels`.
+fn joined(channels: &[Channel]) -> Option<Rig> {
+    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    rig.connect().unwrap();
+    join(&mut rig, channels).unwrap();
+    Some(rig)
+}
+
+/// Full load of the shortest frames on a channel that only listens, for `ms` from now on.
+fn saturate(rig: &mut Rig, channel: Channel, ms: u64) {
+    rig.listen(channel, MEGABIT).unwrap();
+    let from = rig.now();
+    rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + ms * MS));
+}
+
+/// Spacing within 2 us of the plan's, and each confirmation's stamp at most 3.5 us after the frame's end.
+fn hold_times(what: &str, replayed: Option<&[Replayed]>) {
+    let replayed = replayed.unwrap_or_else(|| panic!("{what}: not all frames in order"));
+    for one in replayed {
+        eprintln!("{what}: spacing {:.2} us, stamps {:?}", one.late.width_us(), one.stamps);
+        assert!(one.late.width_us() <= 2.0, "{what}: {one:?}");
+        assert!(one.stamps.min_us >= -0.1 && one.stamps.max_us <= 3.5, "{what}: {one:?}");
+    }
+}
+
+#[test]
+fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
+    for (load, seconds) in [(10.0, 0.3), (30.0, 0.15), (60.0, 0.15), (90.0, 0.2), (98.0, 0.2)] {
+        let Some(mut rig) = joined(&[Can1]) else { return };
+        let replayed = replay(&mut rig, &[Can1], load, seconds).unwrap();
+        hold_times(&format!("alone at {load} %"), replayed.as_deref());
+    }
+}
+
+/// The alarm comes early and the rest is waited for at the priority that drains the FIFOs: it must not cost the other channel
+/// a frame.
+#[test]
+fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
+    for load in [30.0, 60.0, 90.0] {
+        let Some(mut rig) = joined(&[Can1]) else { return };
+        saturate(&mut rig, Can2, 280);
+        let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
+        hold_times(&format!("beside 100 % at {load} %"), replayed.as_deref());
+        rig.run_for(100 * MS).unwrap();
+        rig.close(Can2).unwrap();
+        assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+        assert!(rig.ledger.on_bus_count(Can2) > 5_500);
+        assert_eq!(rig.ledger.losses(Can2).total(), 0);
+        let stamps = rig.ledger.stamps();
+        eprintln!("  the other channel's stamps {stamps:?}");
+        // A request's packet is read from USB with interrupts masked for 3 us.
+        assert!(stamps.max - stamps.min <= 3_200, "{stamps:?}");
+    }
+}
+
+#[test]
+fn two_replays_at_once_keep_their_spacing() {
+    for load in [10.0, 30.0, 45.0] {
+        let Some(mut rig) = joined(&[Can1, Can2]) else { return };
+        let replayed = replay(&mut rig, &[Can1, Can2], load, 0.15).unwrap();
+        hold_times(&format!("both at {load} %"), replayed.as_deref());
+    }
+}
+
+/// Two emulated seconds, streamed: 17 500 frames, each sent once, in order, and confirmed with the time of its end.
+#[test]
+fn a_stream_of_eight_byte_frames_fills_the_bus() {
+    let Some(mut rig) = joined(&[Can1]) else { return };
+    let filled = fill(&mut rig, &[Can1], Kind::Std8, 2.0).unwrap().expect("all frames in order");
+    eprintln!("{filled:?}");
+    assert!(filled[0].load_percent >= 99.0 && filled[0].frames > 17_000, "{filled:?}");
+    assert!(filled[0].stamps.min_us >= -0.1 && filled[0].stamps.max_us <= 3.5, "{filled:?}");
+}
+
+/// Faster than the device takes them: the host waits, and nothing is dropped.
+#[test]
+fn two_streams_at_once_lose_and_reorder_nothing() {
+    let Some(mut rig) = joined(&[Can1, Can2]) else { return };
+    let filled = fill(&mut rig, &[Can1, Can2], Kind::Std8, 0.2).unwrap().expect("all frames in order");
+    eprintln!("{filled:?}");
+    assert!(filled.iter().all(|one| one.load_percent >= 75.0), "{filled:?}");
+}

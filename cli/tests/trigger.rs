@@ -64,3 +64,14 @@ fn a_device_is_decoded_live() {
     let values: Vec<_> = out.lines().filter_map(|line| line.split_once(") ")).map(|(_, line)| line).collect();
     assert_eq!(values[..2], ["can0 001 Engine: Speed = -40 km/h", "can0 001 Engine: Speed = -38 km/h"]);
 }
+
+#[test]
+fn a_device_is_searched_live_with_context() {
+    let search = ["search", "--db", "car.dbc", "-e", "Speed == -36", "-C", "1", "-m", "1"];
+    let (code, out, err) = cantap("search", &search);
+    assert_eq!(code, Some(0), "{err}");
+    let found: Vec<_> = out.lines().map(|line| line.split(' ').nth(2).unwrap_or_default()).collect();
+    assert_eq!(found, ["001#01", "001#02", "001#03"], "{out}");
+    let (code, out, err) = cantap("search", &["search", "--id", "7FF", "-t", "100ms"]);
+    assert_eq!((code, out.as_str()), (Some(1), ""), "{err}");
+}

@@ -16,6 +16,7 @@ use super::decode;
 use crate::databases::DatabaseArgs;
 use crate::exit;
 use crate::input::ReadArgs;
+use crate::live::LiveArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -23,15 +24,16 @@ use crate::input::ReadArgs;
     cantap search trace.log --id 123 --data '11 ?? 3?'\n  \
     cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
     cantap search trace.blf --data '* DE AD' -o found.asc\n  \
-    cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n\n\
+    cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n  \
+    cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n\n\
     A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id,\n\
     dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > >=,\n\
     not, and, or, parentheses.\n\n\
     Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
 pub struct Args {
     /// The trace; - for standard input.
-    #[arg(value_name = "FILE")]
-    input: PathBuf,
+    #[arg(value_name = "FILE", required_unless_present = "device")]
+    input: Option<PathBuf>,
     /// What must hold, such as "Speed > 80 and Gear == 3".
     #[arg(value_name = "CONDITION", conflicts_with = "condition")]
     positional: Option<String>,
@@ -42,8 +44,10 @@ pub struct Args {
     #[arg(short, long = "id", value_name = "ID")]
     ids: Vec<IdPattern>,
     /// These data bytes from the first on: "11 ?? 3?"; * for any number. Repeat for any of several.
-    #[arg(short, long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES")]
     data: Vec<DataPattern>,
+    #[command(flatten)]
+    live: LiveArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
     /// Show so many records after each one found.
@@ -97,7 +101,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
-    let mut records = args.read.open(&args.input)?;
+    let mut records = args.read.open_either(args.input.as_deref(), &args.live)?;
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
     let (mut found, mut still_after) = (0, 0);
     // Whether something lies between the last record shown and the next.

@@ -17,6 +17,14 @@ const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, o
 /// What stands between a file's name and the condition on which it is written.
 const IF: &str = " if ";
 
+/// A file's name, and the condition on which it is written, if there is one.
+pub fn parts(text: &Path) -> (&Path, Option<&str>) {
+    match text.to_str().and_then(|text| text.split_once(IF)) {
+        None => (text, None),
+        Some((path, condition)) => (Path::new(path.trim()), Some(condition.trim())),
+    }
+}
+
 /// A file that grows.
 pub struct Recorder {
     path: PathBuf,
@@ -30,12 +38,13 @@ impl Recorder {
     /// Creates the file, in the format of its suffix. Behind the name may stand a condition, as in
     /// `fast.blf if Speed > 80`: then only what is around such events is recorded.
     pub fn create(text: &Path, decoder: &Decoder) -> anyhow::Result<Self> {
-        let (path, trigger) = match text.to_str().and_then(|text| text.split_once(IF)) {
-            None => (text, None),
-            Some((path, condition)) => {
-                let condition = Condition::new(condition.trim(), decoder)
+        let (path, condition) = parts(text);
+        let trigger = match condition {
+            None => None,
+            Some(condition) => {
+                let condition = Condition::new(condition, decoder)
                     .map_err(|error| anyhow::anyhow!("nothing is recorded: {error}"))?;
-                (Path::new(path.trim()), Some(Trigger::new(condition, WINDOW)))
+                Some(Trigger::new(condition, WINDOW))
             }
         };
         let writer = create_writer(path, &WriteOptions::default())

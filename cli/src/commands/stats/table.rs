@@ -98,9 +98,13 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             (lost.host, "in the host"),
             (lost.unknown, "somewhere"),
         ];
-        let least = if lost.at_least { "at least " } else { "" };
-        let _ =
-            writeln!(out, "  lost      {least}{} at {} places: {}", lost.total, lost.gaps, listed(&stages));
+        let places = if lost.gaps == 1 { "1 place".to_owned() } else { format!("{} places", lost.gaps) };
+        let _ = match (lost.total, lost.at_least) {
+            // As while a device was gone.
+            (0, _) => writeln!(out, "  lost      an unknown number at {places}"),
+            (total, true) => writeln!(out, "  lost      at least {total} at {places}: {}", listed(&stages)),
+            (total, false) => writeln!(out, "  lost      {total} at {places}: {}", listed(&stages)),
+        };
     }
     if let Some(state) = channel.state {
         let counters = channel.error_counters;

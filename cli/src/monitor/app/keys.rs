@@ -5,6 +5,7 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, Mo
 use super::super::model::Model;
 use super::super::source::Order;
 use super::super::views::{self, trace};
+use super::search::Direction;
 use super::{App, Flow, PromptKind, View};
 
 /// The row where a page's own rows begin, its heading.
@@ -16,6 +17,7 @@ impl App {
     /// A key was pressed.
     pub fn key(&mut self, key: KeyEvent, model: &mut Model) -> Flow {
         self.message.clear();
+        self.search = None;
         // Whoever presses a key has read it.
         model.notice.clear();
         let key = match (key.code, key.modifiers) {
@@ -89,8 +91,8 @@ impl App {
     /// Keys that mean something on this page only.
     fn page_key(&mut self, code: KeyCode, model: &mut Model) {
         match (self.view, code) {
-            (View::Trace, KeyCode::Char('n')) => self.find(model, trace::Direction::Back),
-            (View::Trace, KeyCode::Char('N')) => self.find(model, trace::Direction::Forward),
+            (View::Trace, KeyCode::Char('n')) => self.find(model, Direction::Back),
+            (View::Trace, KeyCode::Char('N')) => self.find(model, Direction::Forward),
             (View::Trace, KeyCode::Char('y')) => self.copy(model),
             (View::Trace, code) => self.scroll_trace(code, model),
             (View::Fixed, KeyCode::Char('s')) => self.sort = self.sort.next(),

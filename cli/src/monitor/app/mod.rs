@@ -5,6 +5,7 @@ mod keys;
 mod line;
 mod prompt;
 mod scroll;
+mod search;
 mod sending;
 
 use std::sync::mpsc::Sender;
@@ -15,6 +16,7 @@ use super::model::{Model, Seen};
 use super::source::{Order, Plan};
 use super::theme::Theme;
 use super::views::fixed;
+use search::Search;
 
 pub use line::Line;
 pub use prompt::{Prompt, PromptKind};
@@ -94,8 +96,10 @@ pub struct App {
     pub cursor: Option<u64>,
     /// Place of the first record below the trace's page, as last drawn.
     pub bottom: u64,
-    /// What was last looked for.
-    pub search: String,
+    /// What was last looked for, in capitals.
+    wanted: String,
+    /// The search that is under way.
+    search: Option<Search>,
     /// The fixed view's column that rows are sorted by.
     pub sort: fixed::Column,
     /// Sorted the other way round.
@@ -155,7 +159,8 @@ impl App {
             time_mode: TimeMode::Relative,
             cursor: None,
             bottom: 0,
-            search: String::new(),
+            wanted: String::new(),
+            search: None,
             sort: fixed::Column::Id,
             reverse: false,
             grouped: false,
@@ -177,8 +182,9 @@ impl App {
         }
     }
 
-    /// Takes over what the source found out. To be called before each drawing.
+    /// Takes over what the source found out, and goes on with a search. To be called before each drawing.
     pub fn catch_up(&mut self, model: &mut Model) {
+        self.search_on(model);
         if let Some(plan) = model.found.take() {
             self.plan = Some(plan);
         }

@@ -1,13 +1,14 @@
 //! Lines of input: what is asked for, and what becomes of the answer.
 
-use std::path::PathBuf;
+use std::path::Path;
 
 use cantap::filter::Filter;
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
+use super::super::recorder;
 use super::super::source::Order;
-use super::super::views::trace;
+use super::search::Direction;
 use super::{App, Line, parse_entry};
 
 /// What a line of input is for.
@@ -58,18 +59,15 @@ impl App {
         let text = line.trim();
         let result = match prompt.kind {
             PromptKind::Search => {
-                self.search = text.to_ascii_uppercase();
+                self.wanted = text.to_ascii_uppercase();
                 if !text.is_empty() {
-                    self.find(model, trace::Direction::Back);
+                    self.find(model, Direction::Back);
                 }
                 Ok(())
             }
             PromptKind::Filter => self.set_filters(text, model),
             PromptKind::Record | PromptKind::Send if text.is_empty() => Ok(()),
-            PromptKind::Record => {
-                self.order(Order::Record(PathBuf::from(text)));
-                Ok(())
-            }
+            PromptKind::Record => self.record(Path::new(text)),
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
@@ -80,21 +78,21 @@ impl App {
         }
     }
 
+    fn record(&mut self, text: &Path) -> Result<(), String> {
+        let (path, _) = recorder::parts(text);
+        if path.exists() {
+            let path = path.display();
+            return Err(format!("{path} exists already; choose another name, or remove it first"));
+        }
+        self.order(Order::Record(text.to_owned()));
+        Ok(())
+    }
+
     fn set_filters(&mut self, text: &str, model: &mut Model) -> Result<(), String> {
         let filters =
             text.split_whitespace().map(|part| part.parse::<Filter>().map_err(|error| error.to_string()));
         let filters = filters.collect::<Result<Vec<_>, _>>()?;
         self.cursor = model.history.set_filters(filters, self.cursor);
         Ok(())
-    }
-
-    pub(super) fn find(&mut self, model: &Model, direction: trace::Direction) {
-        if self.search.is_empty() {
-            return self.ask(PromptKind::Search, "");
-        }
-        match trace::find(model, self.cursor, &self.search, direction) {
-            Some(place) => self.cursor = Some(place),
-            None => self.message = format!("'{}' is not there", self.search),
-        }
     }
 }

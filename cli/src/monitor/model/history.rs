@@ -111,9 +111,10 @@ impl History {
         self.records.len()
     }
 
-    /// Bytes in use, and bytes there may be.
+    /// Bytes in use, the list's included, and bytes there may be of records.
     pub fn memory(&self) -> (usize, usize) {
-        (self.records.len() * size_of::<TraceRecord>(), self.most * size_of::<TraceRecord>())
+        let used = self.records.len() * size_of::<TraceRecord>() + self.listed.len() * size_of::<u64>();
+        (used, self.most * size_of::<TraceRecord>())
     }
 
     /// Forgets everything but the filters; numbers and places go on.

@@ -136,7 +136,9 @@ impl Source<'_> {
     fn leave_file(&mut self, plan: super::Plan) {
         let mut model = lock(self.model);
         model.unread = None;
+        model.first_ns = None;
         model.interrupt();
+        model.begin_statistics();
         drop(model);
         self.run_device(plan);
     }

@@ -1,10 +1,13 @@
 //! What keys do.
 
+use cantap::signals::Decoder;
+use cantap::stats::Options;
 use cantap::wire::message::Mode;
 use cantap::{Channel, TraceRecord};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::super::app::{Flow, TimeMode, View};
+use super::super::model::Model;
 use super::super::source::Order;
 use super::{app, model, press, screen_text};
 
@@ -51,6 +54,38 @@ fn a_search_finds_older_and_newer_frames_by_bytes_and_by_name() {
     assert_eq!(app.message, "'7FF#1234' is not there");
     press(&mut app, &mut model, "y");
     assert!(app.clipboard.unwrap().contains("can0 09F80102#"));
+}
+
+/// A long trace is searched a piece at a time, and keys are answered meanwhile.
+#[test]
+fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
+    let mut model = Model::new(Decoder::new(Vec::new()).into(), Options::default(), 16_000_000).unwrap();
+    let record = |n: i64| {
+        let event = super::frame(if n == 1000 { "7AB#" } else { "123#11" });
+        TraceRecord { time_ns: n, channel: 1, event }
+    };
+    model.take(&(0..350_000).map(record).collect::<Vec<_>>());
+    let (mut app, _orders) = app(View::Trace);
+    press(&mut app, &mut model, "/7ab\n");
+    let mut drawings = 0;
+    while app.cursor.is_none() {
+        assert_eq!(app.message, "looking for '7AB'; any key stops");
+        app.catch_up(&mut model);
+        drawings += 1;
+    }
+    assert_eq!((app.cursor, drawings, app.message.as_str()), (Some(1000), 3, ""));
+    press(&mut app, &mut model, "N");
+    assert!(app.message.starts_with("looking for"));
+    press(&mut app, &mut model, "j");
+    for _ in 0..5 {
+        app.catch_up(&mut model);
+    }
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), ""));
+    press(&mut app, &mut model, "N");
+    for _ in 0..5 {
+        app.catch_up(&mut model);
+    }
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' is not there"));
 }
 
 #[test]

@@ -107,11 +107,10 @@ fn said(app: &App, model: &Model) -> Option<String> {
     if !app.message.is_empty() {
         return Some(app.message.clone());
     }
-    if !model.notice.is_empty() {
-        return Some(model.notice.clone());
-    }
     match (&model.source, &model.unread) {
-        (SourceState::Gone(reason), _) => Some(reason.clone()),
+        (SourceState::Gone(reason), _) if model.notice.is_empty() => Some(reason.clone()),
+        (SourceState::Gone(reason), _) => Some(format!("{}; {reason}", model.notice)),
+        _ if !model.notice.is_empty() => Some(model.notice.clone()),
         (_, Some((count, first))) if app.view == View::Statistics => {
             let places = if *count == 1 { "place" } else { "places" };
             Some(format!("{count} {places} could not be read and are left out, the first: {first}"))

@@ -122,8 +122,12 @@ fn analogue(
     let range = [low - margin, high + margin];
     let mut title = vec![Span::raw(format!(" {label} {} to {} ", short(low), short(high)))];
     for (index, row) in rows.iter().enumerate() {
-        let value = window.value(row).unwrap_or(row.value);
-        let text = format!("{} {}  ", name(row, seen), short(value));
+        // At the cursor there may have been no value yet.
+        let value = match window.cursor {
+            None => short(row.value),
+            Some(_) => window.value(row).map_or("–".to_owned(), short),
+        };
+        let text = format!("{} {value}  ", name(row, seen));
         title.push(Span::styled(text, app.theme.series(first_colour + index)));
     }
     let colour = |style: Style| style.fg.unwrap_or_default();
@@ -193,10 +197,17 @@ fn lane(
         levels[from..].iter_mut().for_each(|cell| *cell |= level);
     }
     let style = app.theme.series(colour);
-    let line: String = levels.into_iter().map(|level| symbols[level]).collect();
-    let text = vec![
-        Line::from(format!(" {} {}", name(row, seen), seen.signals.text(row))).style(style),
-        Line::from(line).style(style),
-    ];
+    let mut line: Vec<char> = levels.into_iter().map(|level| symbols[level]).collect();
+    let mut value = seen.signals.text(row);
+    if let Some(share) = window.cursor {
+        let place = ((share * columns as f64) as usize).min(columns.saturating_sub(1));
+        if let Some(cell) = line.get_mut(place) {
+            *cell = if app.theme.unicode { '│' } else { '|' };
+        }
+        value = window.value(row).map_or("–".to_owned(), short);
+    }
+    let line: String = line.into_iter().collect();
+    let text =
+        vec![Line::from(format!(" {} {value}", name(row, seen))).style(style), Line::from(line).style(style)];
     frame.render_widget(Paragraph::new(text), area);
 }

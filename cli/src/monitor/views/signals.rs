@@ -12,6 +12,8 @@ use super::super::model::{Model, Seen, SignalRow};
 
 /// Columns of the small curve.
 const SPARK_COLUMNS: usize = 16;
+/// Time that each of them stands for: the last eight seconds altogether.
+const SPARK_COLUMN_NS: i64 = 500_000_000;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
@@ -31,7 +33,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     let width = usize::from(area.width);
     let name_columns = width.saturating_sub(2 + 2 + 22 + 10 + 10 + SPARK_COLUMNS + 5).clamp(12, 48);
     let heading = Line::from(format!(
-        "  C {:<name_columns$} {:>22} {:>10} {:>10} Past",
+        "  C {:<name_columns$} {:>22} {:>10} {:>10} Last 8 s",
         "Signal", "Value", "Min", "Max"
     ));
     super::list(frame, area, app, heading, app.signal_order.len(), |index, app| {
@@ -56,7 +58,7 @@ fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'s
         Span::raw(format!("{} {name:<name_columns$} ", row.channel)),
         Span::styled(format!("{value:>21}{arrow}"), style),
         Span::styled(format!(" {:>10} {:>10} ", short(row.min), short(row.max)), theme.label()),
-        Span::styled(spark(row, theme.unicode), theme.series(0)),
+        Span::styled(spark(row, seen.now_ns, theme.unicode), theme.series(0)),
     ])
 }
 
@@ -70,21 +72,25 @@ pub fn short(value: f64) -> String {
     if rounded.len() <= 10 { rounded } else { format!("{value:.3e}") }
 }
 
-/// The last samples as a row of blocks, from their lowest to their highest.
-fn spark(row: &SignalRow, unicode: bool) -> String {
+/// The recent past as a row of blocks, each the value that the signal had then, from its lowest to its highest.
+fn spark(row: &SignalRow, now_ns: i64, unicode: bool) -> String {
     let levels: &[char] = if unicode {
         &['▁', '▂', '▃', '▄', '▅', '▆', '▇', '█']
     } else {
         &['_', '.', '-', '=', '*', '#']
     };
-    let first = row.samples.len().saturating_sub(SPARK_COLUMNS);
-    let samples = || row.samples.iter().skip(first);
-    let low = samples().map(|sample| sample.min).fold(f64::INFINITY, f64::min);
-    let high = samples().map(|sample| sample.max).fold(f64::NEG_INFINITY, f64::max);
-    samples()
-        .map(|sample| {
-            let share = if high > low { (sample.last - low) / (high - low) } else { 0.0 };
-            levels[((share * (levels.len() - 1) as f64).round() as usize).min(levels.len() - 1)]
+    let before = |column: usize| now_ns.saturating_sub((SPARK_COLUMNS - 1 - column) as i64 * SPARK_COLUMN_NS);
+    let values: Vec<_> = (0..SPARK_COLUMNS)
+        .map(|column| {
+            let until = row.samples.partition_point(|sample| sample.time_ns <= before(column));
+            until.checked_sub(1).map(|last| row.samples[last].last)
         })
-        .collect()
+        .collect();
+    let low = values.iter().flatten().copied().fold(f64::INFINITY, f64::min);
+    let high = values.iter().flatten().copied().fold(f64::NEG_INFINITY, f64::max);
+    let level = |value: f64| {
+        let share = if high > low { (value - low) / (high - low) } else { 0.0 };
+        levels[((share * (levels.len() - 1) as f64).round() as usize).min(levels.len() - 1)]
+    };
+    values.into_iter().map(|value| value.map_or(' ', level)).collect()
 }

@@ -14,15 +14,6 @@ use super::super::app::{App, TimeMode};
 use super::super::model::Model;
 use super::super::theme::Theme;
 
-/// Which way to look.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Direction {
-    /// To older records.
-    Back,
-    /// To newer records.
-    Forward,
-}
-
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let history = &model.history;
@@ -135,7 +126,7 @@ pub fn printable(data: &[u8]) -> String {
 }
 
 /// What a record says that is no frame.
-fn event_text(event: &TraceEvent) -> String {
+pub fn event_text(event: &TraceEvent) -> String {
     let counters = |counters: Option<(u8, u8)>| {
         counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
     };
@@ -208,34 +199,4 @@ pub fn candump_line(model: &Model, number: u64) -> Option<String> {
     let record = model.history.get(number)?;
     let frame = record.frame()?;
     Some(format!("({}) can{} {frame}", seconds(record.time_ns), record.channel.saturating_sub(1)))
-}
-
-/// Place of the next listed record whose frame, name or event contains `text` (in capitals), from `cursor` on.
-pub fn find(model: &Model, cursor: Option<u64>, text: &str, direction: Direction) -> Option<u64> {
-    let (first, end) = (model.history.first(), model.history.end());
-    let compact: String = text.chars().filter(|character| !character.is_whitespace()).collect();
-    // One for all of millions of records.
-    let mut line = String::new();
-    let mut contains = |what: &dyn std::fmt::Display, wanted: &str| {
-        line.clear();
-        // Writing to a String cannot fail.
-        let _ = write!(line, "{what}");
-        line.make_ascii_uppercase();
-        line.contains(wanted)
-    };
-    let mut matches = |place: &u64| match model.history.get(*place) {
-        None => false,
-        Some(record) => match record.frame() {
-            Some(frame) => {
-                contains(frame, &compact)
-                    || model.seen.signals.name_of(record).is_some_and(|name| contains(&name, text))
-            }
-            None => contains(&event_text(&record.event), text),
-        },
-    };
-    let from = cursor.unwrap_or(end);
-    match direction {
-        Direction::Back => (first..from.min(end)).rev().find(&mut matches),
-        Direction::Forward => (from.saturating_add(1).max(first)..end).find(&mut matches),
-    }
 }

@@ -1,0 +1,113 @@
+//! Looking for something in the trace: a piece at a time, so that millions of records hold up neither the source nor the display.
+
+use std::fmt::{Display, Write};
+
+use super::super::model::Model;
+use super::super::views::trace;
+use super::{App, PromptKind};
+
+/// Records that are looked at between two drawings, in some twenty milliseconds.
+const AT_ONCE: u64 = 100_000;
+
+/// Which way to look.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Direction {
+    /// To older records.
+    Back,
+    /// To newer records.
+    Forward,
+}
+
+/// A search under way.
+#[derive(Clone, Copy, Debug)]
+pub struct Search {
+    direction: Direction,
+    /// The place to go on at; going back, the one behind it.
+    at: u64,
+}
+
+impl App {
+    /// Looks for the next record that has what was last looked for.
+    pub(super) fn find(&mut self, model: &Model, direction: Direction) {
+        if self.wanted.is_empty() {
+            return self.ask(PromptKind::Search, "");
+        }
+        let from = self.cursor.unwrap_or(model.history.end());
+        let at = match direction {
+            Direction::Back => from,
+            Direction::Forward => from.saturating_add(1),
+        };
+        self.search = Some(Search { direction, at });
+        self.search_on(model);
+    }
+
+    /// Goes on with a search for a while.
+    pub(super) fn search_on(&mut self, model: &Model) {
+        let Some(search) = self.search.take() else {
+            return;
+        };
+        let (first, end) = (model.history.first(), model.history.end());
+        let (range, rest) = match search.direction {
+            Direction::Back => {
+                let until = search.at.min(end);
+                let from = until.saturating_sub(AT_ONCE).max(first);
+                (from..until, Some(from).filter(|from| *from > first))
+            }
+            Direction::Forward => {
+                let from = search.at.max(first);
+                let until = from.saturating_add(AT_ONCE).min(end);
+                (from..until, Some(until).filter(|until| *until < end))
+            }
+        };
+        let mut matcher = Matcher { text: &self.wanted, compact: compact(&self.wanted), line: String::new() };
+        let found = match search.direction {
+            Direction::Back => range.rev().find(|place| matcher.matches(model, *place)),
+            Direction::Forward => range.into_iter().find(|place| matcher.matches(model, *place)),
+        };
+        match (found, rest) {
+            (Some(place), _) => {
+                self.cursor = Some(place);
+                self.message.clear();
+            }
+            (None, Some(at)) => {
+                self.search = Some(Search { at, ..search });
+                self.message = format!("looking for '{}'; any key stops", self.wanted);
+            }
+            (None, None) => self.message = format!("'{}' is not there", self.wanted),
+        }
+    }
+}
+
+fn compact(text: &str) -> String {
+    text.chars().filter(|character| !character.is_whitespace()).collect()
+}
+
+struct Matcher<'a> {
+    /// In capitals.
+    text: &'a str,
+    /// The same without blanks, for bytes.
+    compact: String,
+    /// One for all records.
+    line: String,
+}
+
+impl Matcher<'_> {
+    fn matches(&mut self, model: &Model, place: u64) -> bool {
+        let Some(record) = model.history.get(place) else {
+            return false;
+        };
+        let Some(frame) = record.frame() else {
+            return self.is_in(&trace::event_text(&record.event), false);
+        };
+        self.is_in(frame, true)
+            || model.seen.signals.name_of(record).is_some_and(|name| self.is_in(&name, false))
+    }
+
+    fn is_in(&mut self, what: &dyn Display, compact: bool) -> bool {
+        self.line.clear();
+        // Writing to a String cannot fail.
+        let _ = write!(self.line, "{what}");
+        self.line.make_ascii_uppercase();
+        self.line.contains(if compact { &self.compact } else { self.text })
+    }
+}

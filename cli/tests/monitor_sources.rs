@@ -1,0 +1,155 @@
+//! Where the live view's records come from, and where they go: files with faults in them, the emulated board, recordings on
+//! a condition.
+#![cfg(unix)]
+
+#[expect(dead_code, reason = "other tests use the rest of it")]
+mod terminal;
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use cantap::formats::{ReadOptions, open_reader};
+use terminal::Terminal;
+
+fn write(folder: &Path, name: &str, text: &str) -> String {
+    let path = folder.join(name);
+    std::fs::write(&path, text).unwrap();
+    path.display().to_string()
+}
+
+#[test]
+fn what_cannot_be_read_in_a_file_is_counted_and_the_first_of_it_shown() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = write(
+        folder.path(),
+        "faulty.log",
+        "(1.0) can0 123#11\n(1.1) can0 nonsense\n(1.2) can0 124#22\nand more of it\n(1.3) can0 125#33\n",
+    );
+    let mut view = Terminal::start(&format!("monitor {file} --view statistics"), (120, 24));
+    view.wait_for("2 unreadable");
+    let text = view.wait_for("2 places could not be read and are left out, the first: ");
+    assert!(text.contains("faulty.log:2") || text.contains("line 2"), "{text}");
+    view.keys("2");
+    view.wait_until("the rest", |screen| ["123", "124", "125"].iter().all(|id| screen.contains(id)));
+    // Once more from its beginning: counted anew, not on top.
+    view.keys("l");
+    view.wait_for("loop");
+    view.keys("5");
+    view.wait_for("2 unreadable");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut log = String::new();
+    for n in 0..1000 {
+        writeln!(log, "({}.{:06}) can0 {:03X}#11", n / 10, n % 10 * 100_000, n % 8).unwrap();
+    }
+    let file = write(folder.path(), "long.log", &log);
+    let mut view = Terminal::start(&format!("monitor {file} -b 500k --view trace"), (120, 24));
+    view.wait_for("playing, delay ×1");
+    view.keys(",");
+    view.wait_for("delay ×2");
+    view.keys("p");
+    view.wait_for("stopped");
+    let rows = |screen: &str| screen.lines().filter(|line| line.contains(" D 1 11")).count();
+    let before = rows(&view.text());
+    view.keys(">>");
+    view.wait_until("two more", |screen| rows(screen) == before + 2);
+    view.keys("p..........");
+    view.wait_for("ended, as fast as can be");
+    // It sends nothing, and says what would.
+    view.keys("6a123#1122\r\r");
+    view.wait_for("a file sends nothing; open a device with D");
+    view.keys("D\x15virtual:load=30\r");
+    view.wait_for("virtual:load=30 listen-only: running");
+    view.keys("5");
+    view.wait_for("Channel 1: 500000 bit/s");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
+    let folder = tempfile::tempdir().unwrap();
+    let database = write(
+        folder.path(),
+        "car.toml",
+        "version = 1\n[[message]]\nname = \"Engine\"\nid = 0x123\nlength = 1\n[[message.signal]]\nname = \"Speed\"\nat = \"D1\"\n",
+    );
+    // A minute, ten frames a second, fast at 30 s only.
+    let mut log = String::new();
+    for n in 0..600 {
+        let speed = if n == 300 { 100 } else { 10 };
+        writeln!(log, "({}.{}) can0 123#{speed:02X}", n / 10, n % 10).unwrap();
+    }
+    let file = write(folder.path(), "drive.log", &log);
+    let recording = folder.path().join("fast.asc");
+    let mut view = Terminal::start(&format!("monitor {file} -b 500k --db {database}"), (120, 24));
+    view.wait_for("playing");
+    // A condition that is none is refused, and what it was is said.
+    view.keys(&format!("r{} if Sped > 80\r", recording.display()));
+    view.wait_for("nothing is recorded: ");
+    view.keys(&format!("r{} if Speed > 80\r", recording.display()));
+    view.wait_for("REC");
+    view.keys("..........7");
+    view.wait_for("ended");
+    view.wait_for("Records   71");
+    view.keys("r");
+    view.wait_for("71 records are in");
+    // What was recorded is not overwritten by a slip.
+    view.keys(&format!("r{}\r", recording.display()));
+    view.wait_for("exists already; choose another name");
+    view.keys("\x1b");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    let records: Vec<_> =
+        open_reader(&recording, &ReadOptions::default()).unwrap().map(Result::unwrap).collect();
+    let seconds = |at: usize| (records[at].time_ns - records[0].time_ns) as f64 / 1e9;
+    assert_eq!(records.len(), 71);
+    assert!((seconds(20) - 2.0).abs() < 1e-3 && (seconds(70) - 7.0).abs() < 1e-3);
+    assert_eq!(records[20].frame().unwrap().data(), [100]);
+}
+
+/// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it.
+fn elf() -> Option<PathBuf> {
+    if let Some(path) = std::env::var_os("CANTAP_FIRMWARE_ELF") {
+        return Some(PathBuf::from(path));
+    }
+    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/firmware/cantap-olimex-p405.elf");
+    if cfg!(feature = "emu") && built.exists() {
+        return Some(built);
+    }
+    eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware` first", built.display());
+    None
+}
+
+#[test]
+fn the_emulated_board_is_watched_sent_with_and_recorded() {
+    let Some(elf) = elf() else {
+        return;
+    };
+    let folder = tempfile::tempdir().unwrap();
+    let recording = folder.path().join("board.blf");
+    let line = format!(
+        "monitor -d emu:{},load=20 -b 500k --view statistics -o {}",
+        elf.display(),
+        recording.display()
+    );
+    let mut view = Terminal::start(&line, (160, 40));
+    view.wait_for("running");
+    view.wait_for("Channel 2: 500000 bit/s");
+    view.wait_for("Device olimex-p405");
+    // Into the bus, and onto it.
+    view.keys("m");
+    view.wait_for("normal: running");
+    view.keys("6a6F7#DEADBEEF\r\r1f6F7:7FF\r");
+    view.wait_for("T      6F7 D 4 DE AD BE EF");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    let records = open_reader(&recording, &ReadOptions::default()).unwrap().map(Result::unwrap);
+    let sent = records.filter(|record| record.frame().is_some_and(|frame| frame.id().raw() == 0x6F7));
+    assert_eq!(sent.count(), 1);
+}

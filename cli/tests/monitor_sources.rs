@@ -103,6 +103,8 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     view.keys(&format!("r{}\r", recording.display()));
     view.wait_for("exists already; choose another name");
     view.keys("\x1b");
+    // Escape and a letter at once would be Alt and that letter.
+    view.wait_until("no prompt", |screen| !screen.contains(" > /"));
     view.keys("q");
     assert_eq!(view.end(), 0);
     let records: Vec<_> =

@@ -6,67 +6,26 @@
 
 use std::io;
 
-use super::analyser::{
-    COLUMNS, Cell, DifConvention, RowDecoder, RowEncoder, TableRow, TableStyle, date_comment,
-};
+use super::analyser::{COLUMNS, Cell, DifConvention, Layout, RowDecoder, TableRow, TableStyle};
 use super::input::Input;
 use super::issue::{Fault, Place};
 use super::output::Patch;
 use super::reader::{Decode, Found};
-use super::writer::{Encode, LeftOut};
 use crate::{TraceEvent, TraceRecord};
 
 /// The number of rows has a fixed width, so that it can be put in at the end.
 const COUNT_DIGITS: usize = 10;
 
 /// Writes DIF.
-pub(crate) struct Encoder {
+pub(crate) struct DifLayout {
     style: TableStyle,
-    rows: RowEncoder,
-    started: bool,
-    /// Where the number of rows stands in the file.
-    count_at: u64,
+    /// Where the number of rows stands in the file, once it does.
+    count_at: Option<u64>,
 }
 
-impl Encoder {
+impl DifLayout {
     pub(crate) fn new(style: TableStyle) -> Self {
-        Self { style, rows: RowEncoder::default(), started: false, count_at: 0 }
-    }
-
-    fn start(&mut self, first_ns: i64, out: &mut Vec<u8>) {
-        if std::mem::replace(&mut self.started, true) {
-            return;
-        }
-        // The start stands in the title, as it does in a comment of the analyser's CSV.
-        let title = date_comment(self.rows.start(first_ns));
-        let count = "0".repeat(COUNT_DIGITS);
-        let columns = COLUMNS.len().to_string();
-        let (vectors, tuples) = match self.style.dif {
-            DifConvention::Columns => (&columns, &count),
-            DifConvention::Rows => (&count, &columns),
-        };
-        let end = self.style.line_end();
-        for (name, number, text) in [
-            ("TABLE", "1", title.as_str()),
-            ("VECTORS", vectors.as_str(), ""),
-            ("TUPLES", tuples.as_str(), ""),
-            ("DATA", "0", ""),
-        ] {
-            out.extend_from_slice(name.as_bytes());
-            out.extend_from_slice(end);
-            out.extend_from_slice(b"0,");
-            if number == count {
-                self.count_at = out.len() as u64;
-            }
-            out.extend_from_slice(number.as_bytes());
-            out.extend_from_slice(end);
-            out.extend_from_slice(format!("\"{text}\"").as_bytes());
-            out.extend_from_slice(end);
-        }
-        self.begin_row(out);
-        for name in COLUMNS {
-            self.cell(out, Cell::Text, name.as_bytes());
-        }
+        Self { style, count_at: None }
     }
 
     fn begin_row(&self, out: &mut Vec<u8>) {
@@ -97,43 +56,57 @@ impl Encoder {
         }
         out.extend_from_slice(end);
     }
+}
+
+impl Layout for DifLayout {
+    fn head(&mut self, date: &str, out: &mut Vec<u8>) {
+        // The start stands in the title, as it does in a comment of the analyser's CSV.
+        let count = "0".repeat(COUNT_DIGITS);
+        let columns = COLUMNS.len().to_string();
+        let (vectors, tuples) = match self.style.dif {
+            DifConvention::Columns => (&columns, &count),
+            DifConvention::Rows => (&count, &columns),
+        };
+        let end = self.style.line_end();
+        for (name, number, text) in [
+            ("TABLE", "1", date),
+            ("VECTORS", vectors.as_str(), ""),
+            ("TUPLES", tuples.as_str(), ""),
+            ("DATA", "0", ""),
+        ] {
+            out.extend_from_slice(name.as_bytes());
+            out.extend_from_slice(end);
+            out.extend_from_slice(b"0,");
+            if number == count {
+                self.count_at = Some(out.len() as u64);
+            }
+            out.extend_from_slice(number.as_bytes());
+            out.extend_from_slice(end);
+            out.extend_from_slice(format!("\"{text}\"").as_bytes());
+            out.extend_from_slice(end);
+        }
+        self.begin_row(out);
+        for name in COLUMNS {
+            self.cell(out, Cell::Text, name.as_bytes());
+        }
+    }
 
     fn row(&self, row: &TableRow, out: &mut Vec<u8>) {
         self.begin_row(out);
         row.cells(self.style.decimal_mark, |kind, cell| self.cell(out, kind, cell));
     }
-}
 
-impl Encode for Encoder {
-    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
-        self.start(record.time_ns, out);
-        if let Some(row) = self.rows.add(record, left_out) {
-            self.row(&row, out);
-        }
-    }
-
-    fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        self.start(0, out);
-        self.provisional_end(out);
-    }
-
-    fn provisional_end(&self, out: &mut Vec<u8>) {
-        if !self.started {
-            return;
-        }
-        if let Some(row) = self.rows.last() {
-            self.row(row, out);
-        }
+    fn end(&self, out: &mut Vec<u8>) {
         for line in [&b"-1,0"[..], b"EOD"] {
             out.extend_from_slice(line);
             out.extend_from_slice(self.style.line_end());
         }
     }
 
-    fn patch(&self, _written: u64) -> Option<Patch> {
+    fn patch(&self, rows: u64) -> Option<Patch> {
         // One more for the names of the columns.
-        let count = format!("{:0COUNT_DIGITS$}", self.rows.rows() + 1);
-        self.started.then(|| Patch { offset: self.count_at, bytes: count.into_bytes() })
+        let count = format!("{:0COUNT_DIGITS$}", rows + 1);
+        self.count_at.map(|offset| Patch { offset, bytes: count.into_bytes() })
     }
 }
 

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 use std::io;
 use std::path::Path;
 
-use super::analyser::TableStyle;
+use super::analyser::{CsvLayout, TableEncoder, TableStyle};
 use super::csv::CsvDialect;
+use super::dif::DifLayout;
 use super::output::{Output, Patch};
 use super::rotate::{Rotating, Rotation};
-use super::{Format, analyser, asc, blf, candump, csv, dif, pcapng, trc};
+use super::{Format, asc, blf, candump, csv, pcapng, trc};
 use crate::{TraceEvent, TraceRecord};
 
 /// Bytes collected before they go to the system.
@@ -154,9 +155,9 @@ impl FileWriter {
             Format::Trc(version) => Box::new(trc::Encoder::new(version)),
             Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
             Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
-            Format::Csv(CsvDialect::Analyser) => Box::new(analyser::CsvEncoder::new(options.table)),
+            Format::Csv(CsvDialect::Analyser) => Box::new(TableEncoder::new(CsvLayout(options.table))),
             Format::Pcapng => Box::new(pcapng::Encoder::default()),
-            Format::Dif => Box::new(dif::Encoder::new(options.table)),
+            Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table))),
         };
         let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
         Self {

@@ -144,6 +144,17 @@ impl ChannelArgs {
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
 
+    /// How channels would be opened, with `mode` unless the user says otherwise. Nothing is opened.
+    pub fn configs(
+        &self,
+        device: &Device,
+        channels: impl IntoIterator<Item = Channel>,
+        mode: Mode,
+    ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
+        let plans = self.plan(device, channels.into_iter(), Some(mode))?;
+        Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
+    }
+
     /// Gives closed channels the configuration and filters that were asked for, without opening them: what
     /// [`Device::save_defaults`] stores. What is not asked for stays as it was saved before.
     pub fn configure(

@@ -243,3 +243,103 @@ fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
     let suppressed: u64 = suppressed.iter().filter(|data| data.starts_with("40")).map(count).sum();
     assert!(suppressed > 500, "{suppressed}");
 }
+
+/// Both channels on one wire, and nobody else acknowledges: a frame gets across only if the other channel was opened.
+#[test]
+fn a_replay_opens_only_the_channels_that_the_trace_sends_on() {
+    let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("one_channel.log");
+    let device = "virtual:wire=joined,ack=no,load=0";
+    std::fs::write(&path, "(1.000000) can0 123#11\n").unwrap();
+    let (code, _, err) = cantap(&format!("replay -d {device} {}", path.display()));
+    assert!(code == Some(1) && err.contains("nobody acknowledged 1 of 1"), "{err}");
+    std::fs::write(&path, "(1.000000) can1 123#11\n(1.200000) can0 124#22\n").unwrap();
+    let (code, out, err) = cantap(&format!("replay -d {device} {} -v", path.display()));
+    assert_eq!(
+        (code, frames(&out)),
+        (Some(0), vec!["can1 123#11 T".into(), "can0 124#22 T".into()]),
+        "{err}"
+    );
+}
+
+#[test]
+fn a_replay_takes_canplayers_options() {
+    let path = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("canplayer.log");
+    std::fs::write(&path, "(1.000000) can0 001#\n(1.010000) can0 002#\n(9.000000) can0 003#\n").unwrap();
+    let play = |options: &str| {
+        let (code, out, err) = cantap(&format!("replay -d virtual:load=0 -v {options}"));
+        assert_eq!(code, Some(0), "{options}: {err}");
+        (frames(&out), times_us(&out))
+    };
+    // Longer pauses than a second are skipped: the next frame follows at once.
+    let (sent, times) = play(&format!("-I {} can1=can0 -s 1 -x", path.display()));
+    assert_eq!(sent, ["can1 001# T", "can1 002# T", "can1 003# T"]);
+    assert!((times[1] - times[0] - 10_000).abs() <= 2 && times[2] - times[1] < 1_000, "{times:?}");
+    let (sent, times) = play(&format!("{} -t -l 2 -n 5", path.display()));
+    assert_eq!(sent.len(), 5);
+    assert!(times[4] - times[0] < 5_000, "{times:?}");
+    let (_, times) = play(&format!("{} -s 1 -g 30", path.display()));
+    assert!(times.windows(2).all(|pair| pair[1] - pair[0] >= 29_900), "{times:?}");
+    for (options, part) in [("-l 0", "from 1, or i"), ("-n 0", "0"), ("stdout=can0", "can0 or 1")] {
+        let (code, _, err) = cantap(&format!("replay -d virtual {} {options}", path.display()));
+        assert!(code == Some(2) && err.contains(part), "{options}: {err}");
+    }
+}
+
+#[test]
+fn made_up_frames_take_cangens_options() {
+    let (code, out, err) = cantap("gen -d virtual:load=0 can0 -g 50 -c 4 -I i -L 0 -n 10 -v -p 10 -i -x");
+    assert_eq!(code, Some(0), "{err}");
+    let times = times_us(&out);
+    // Bursts of four: 47 to 56 bits at 500 kbit/s from frame to frame, 50 ms from burst to burst.
+    for (at, pair) in times.windows(2).enumerate() {
+        let gap = pair[1] - pair[0];
+        assert!(if at % 4 == 3 { gap > 45_000 } else { (90..130).contains(&gap) }, "{times:?}");
+    }
+    // They begin so far apart, and the first frame has some stuff bits more.
+    assert!((times[8] - times[0] - 100_000).abs() <= 20, "{times:?}");
+    for (options, code, part) in [
+        ("-f", 1, "classical CAN"),
+        ("-E", 1, "classical CAN"),
+        ("-L 9", 1, "-8 allows"),
+        ("-L 16", 2, "a length from 0 to 8"),
+        ("-I 20000000", 2, "up to 1FFFFFFF"),
+        ("-D 112233445566778899", 2, "up to 8 bytes"),
+        ("-n 0", 2, "0"),
+        ("-c 0", 2, "0"),
+    ] {
+        let (found, _, err) = cantap(&format!("gen -d virtual can0 {options}"));
+        assert!(found == Some(code) && err.contains(part), "{options}: {err}");
+    }
+}
+
+/// As `man candump` has them.
+#[test]
+fn filters_are_candumps() {
+    let ids = |filter: &str| -> Vec<String> {
+        let line = format!("capture -d virtual:frames=mix,errors=5 -c 1 -b 500k -n 60 -t 5s -f {filter}");
+        let (code, out, err) = cantap(&line);
+        assert_eq!(code, Some(0), "{filter}: {err}");
+        let frames = frames(&out).into_iter().filter(|frame| frame.contains('#'));
+        frames.map(|frame| frame[5..].to_owned()).collect()
+    };
+    let is_error = |frame: &String| frame.starts_with("200");
+    let all = ids("any");
+    assert!(
+        all.iter().any(|frame| frame.find('#') == Some(8)) && all.iter().any(|frame| frame.contains("#R"))
+    );
+    // Eight digits are a 29-bit identifier; C-something tells standard data frames from the others.
+    assert!(ids("any,00000000:80000000").iter().all(|frame| frame.find('#') == Some(8) && !is_error(frame)));
+    assert!(ids("can0,000:C0000000").iter().all(|frame| frame.find('#') == Some(3) && !frame.contains('R')));
+    // Joined: both must hold.
+    let joined = ids("can0,000:C0000400,001:001,j");
+    let id = |frame: &String| u32::from_str_radix(&frame[..3], 16).unwrap();
+    assert!(!joined.is_empty() && joined.iter().all(|frame| id(frame) & 0x401 == 1), "{joined:?}");
+    // Only errors, none of the frames.
+    let (code, out, err) = cantap("capture -d virtual:errors=30 -c 1 -b 500k -t 300ms -f any,0~0,#FFFFFFFF");
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.lines().count() > 5 && out.lines().all(|line| line.contains(" 200")), "{out}");
+    for wrong in ["123:", "xyz:7FF", "can0,123:7FF,q", "20000000"] {
+        let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -f {wrong}"));
+        assert!(code == Some(2) && err.contains("filter"), "{wrong}: {err}");
+    }
+}

@@ -22,17 +22,19 @@ const LEAD: Duration = Duration::from_millis(100);
 pub struct Pace {
     /// 2 plays twice as fast, 0.5 at half the speed.
     pub speed: f64,
-    /// Longer pauses are shortened to this.
+    /// Longer pauses are skipped: the next frame follows at once.
     pub longest_gap: Option<Duration>,
-    /// Frames begin at least so long after each other, on all channels together.
+    /// Bursts begin at least so long after each other, on all channels together.
     pub shortest_gap: Duration,
+    /// Frames of a burst, from 1: those after its first wait for nothing but the trace's own times.
+    pub burst: u32,
     /// As fast as the bus takes them.
     pub ignore_times: bool,
 }
 
 impl Default for Pace {
     fn default() -> Self {
-        Self { speed: 1.0, longest_gap: None, shortest_gap: Duration::ZERO, ignore_times: false }
+        Self { speed: 1.0, longest_gap: None, shortest_gap: Duration::ZERO, burst: 1, ignore_times: false }
     }
 }
 
@@ -45,12 +47,21 @@ pub struct Timetable {
     first_ticks: u64,
     /// Begin of the last frame in the trace and in the replay, in ns since the first.
     last: Option<(i64, f64)>,
+    /// Begin of the burst under way, in ns since the first, and its frames so far.
+    burst: (f64, u32),
 }
 
 impl Timetable {
     /// The first frame begins at `first_ticks` of the device's clock.
     pub fn new(pace: Pace, bitrates_bps: [u32; CHANNELS], tick_hz: u32, first_ticks: u64) -> Self {
-        Self { pace, bitrates_bps, tick_ns: 1e9 / f64::from(tick_hz), first_ticks, last: None }
+        Self {
+            pace,
+            bitrates_bps,
+            tick_ns: 1e9 / f64::from(tick_hz),
+            first_ticks,
+            last: None,
+            burst: (0.0, 0),
+        }
     }
 
     /// A frame's time on the bus without intermission, in ns.
@@ -66,15 +77,20 @@ impl Timetable {
         let at_ns = self.last.map_or(0.0, |(last_ns, last_at_ns)| {
             // Negative where the other channel's shorter frame ended first.
             let mut gap_ns = (begin_ns - last_ns) as f64;
-            if let Some(longest) = self.pace.longest_gap {
-                gap_ns = gap_ns.min(longest.as_nanos() as f64);
+            if self.pace.longest_gap.is_some_and(|longest| gap_ns > longest.as_nanos() as f64) {
+                gap_ns = 0.0;
             }
-            gap_ns /= self.pace.speed;
-            if !self.pace.shortest_gap.is_zero() {
-                gap_ns = gap_ns.max(self.pace.shortest_gap.as_nanos() as f64);
+            let at_ns = last_at_ns + gap_ns / self.pace.speed;
+            let (burst_at_ns, frames) = self.burst;
+            match self.pace.shortest_gap {
+                Duration::ZERO => at_ns,
+                shortest if frames >= self.pace.burst => at_ns.max(burst_at_ns + shortest.as_nanos() as f64),
+                _ => at_ns.max(last_at_ns),
             }
-            last_at_ns + gap_ns
         });
+        let (burst_at_ns, frames) = self.burst;
+        self.burst =
+            if frames == 0 || frames >= self.pace.burst { (at_ns, 1) } else { (burst_at_ns, frames + 1) };
         self.last = Some((begin_ns, at_ns));
         // Whole ticks first: a float does not hold a long uptime's nanoseconds.
         let ticks = |ns: f64| self.first_ticks.saturating_add_signed((ns / self.tick_ns).round() as i64);
@@ -216,8 +232,10 @@ mod tests {
         assert_eq!(begins(Pace::default()), [0, 12_000, 132_000]);
         assert_eq!(begins(Pace { speed: 2.0, ..Pace::default() }), [0, 6_000, 66_000]);
         let longest_gap = Some(Duration::from_millis(2));
-        assert_eq!(begins(Pace { longest_gap, ..Pace::default() }), [0, 12_000, 36_000]);
+        assert_eq!(begins(Pace { longest_gap, ..Pace::default() }), [0, 12_000, 12_000]);
         let shortest_gap = Duration::from_millis(5);
         assert_eq!(begins(Pace { shortest_gap, ..Pace::default() }), [0, 60_000, 180_000]);
+        // The second belongs to the first one's burst; the third is late by itself.
+        assert_eq!(begins(Pace { shortest_gap, burst: 2, ..Pace::default() }), [0, 12_000, 132_000]);
     }
 }

@@ -3,6 +3,7 @@
 use std::process::ExitCode;
 use std::time::Duration;
 
+use anyhow::bail;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
@@ -15,9 +16,10 @@ use crate::sending::{BusWatch, Tally};
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Modes for -I, -L and -D: r random, i counting up, e even random, o odd random, or a value.\n\n\
+    after_help = "Modes for -I, -L and -D: r random, i counting up, e even random, o odd random, or a value. Data that count up are one byte \
+                        at least. A full queue is always waited for, so cangen's -p and -i change nothing.\n\n\
                         Examples:\n  cantap gen -d virtual can0 -g 10 -I 42A -L 8 -D i -n 1000\n  \
-                        cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m"
+                        cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m\n  cantap gen -d virtual can1 -g 100 -c 8 -n 80"
 )]
 pub struct Args {
     /// Where the device is: a serial port, or virtual.
@@ -50,8 +52,29 @@ pub struct Args {
     #[arg(short = 'D', long, value_name = "MODE|HEX", default_value = "r", value_parser = data)]
     data: Data,
     /// End after so many frames.
-    #[arg(short = 'n', long)]
+    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
+    /// Frames of a burst: they follow one another at once, and the gap is from burst to burst.
+    #[arg(short = 'c', long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    burst: u32,
+    /// Lengths up to 15, of which a controller carries eight bytes.
+    #[arg(short = '8', long)]
+    raw_dlc: bool,
+    /// Accepted as cangen's: a full queue is always waited for.
+    #[arg(short = 'p', value_name = "MS", hide = true, value_parser = gap)]
+    poll: Option<f64>,
+    /// Accepted as cangen's: a full queue is no error here.
+    #[arg(short = 'i', hide = true)]
+    ignore_full: bool,
+    /// Accepted as cangen's: what this device sends does not come back to other programs of this computer anyway.
+    #[arg(short = 'x', hide = true)]
+    no_loopback: bool,
+    /// Refused: this is cangen's CAN FD.
+    #[arg(short = 'f', hide = true)]
+    fd: bool,
+    /// Refused: see -f.
+    #[arg(short = 'E', hide = true)]
+    fd_error_state: bool,
     /// Makes another sequence.
     #[arg(long, default_value_t = 1)]
     seed: u64,
@@ -95,10 +118,10 @@ fn identifier(text: &str) -> Result<Values, String> {
 }
 
 fn length(text: &str) -> Result<Values, String> {
-    let number = || text.parse().ok().filter(|length| *length <= 8);
+    let number = || text.parse().ok().filter(|length| *length <= 15);
     mode(text)
         .or_else(|| number().map(Values::Fixed))
-        .ok_or_else(|| "write r, i, e, o or a length from 0 to 8".to_owned())
+        .ok_or_else(|| "write r, i, e, o or a length from 0 to 8, with -8 to 15".to_owned())
 }
 
 fn data(text: &str) -> Result<Data, String> {
@@ -146,11 +169,14 @@ impl Generator<'_> {
         } else {
             Id::standard_truncated(self.number(*id, Id::MAX_STANDARD + 1))
         };
+        let lengths = if self.args.raw_dlc { 16 } else { 9 };
         let length = match (length, data) {
-            (Some(values), _) => self.number(*values, 9),
+            (Some(values), _) => self.number(*values, lengths),
             (None, Data::Fixed(bytes)) => bytes.len() as u32,
-            (None, Data::Varying(_)) => self.random.u32(..9),
+            (None, Data::Varying(_)) => self.random.u32(..lengths),
         };
+        let counts = *data == Data::Varying(Values::Count);
+        let length = if counts && !remote { length.max(1) } else { length };
         let mut bytes = [0; 8];
         match data {
             Data::Fixed(fixed) => bytes[..fixed.len()].copy_from_slice(fixed),
@@ -172,6 +198,12 @@ impl Generator<'_> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.fd || args.fd_error_state {
+        bail!("the device is a classical CAN controller, without CAN FD; leave -f and -E away");
+    }
+    if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
+        bail!("a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight");
+    }
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     let mut bitrates_bps = [0; CHANNELS];
@@ -180,7 +212,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let gap = Duration::from_secs_f64(args.gap / 1e3);
     // A trace of frames that all end at once, held apart by the gap.
-    let pace = Pace { shortest_gap: gap, ignore_times: gap.is_zero(), ..Pace::default() };
+    let pace = Pace { shortest_gap: gap, burst: args.burst, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut tally = Tally::new(!args.verbose);
     let mut bus = BusWatch::new(&device, args.open.rescue(&device));
@@ -230,6 +262,11 @@ mod tests {
         assert_eq!(frames("-I 7FF -L 4 -R", 1), ["7FF#R4"]);
         assert_eq!(frames("-e -I 1 -L 0", 1), ["00000001#"]);
         assert_eq!(frames("-I 1FFFFFFF -L 0", 1), ["1FFFFFFF#"]);
+        // Data that count up are one byte at least.
+        assert_eq!(frames("-I 1 -L 0 -D i", 2), ["001#00", "001#01"]);
+        assert!(frames("-I 1 -L r -D i", 200).iter().all(|frame| !frame.ends_with('#')));
+        assert_eq!(frames("-I 1 -L 15 -8 -D 1122334455667788", 1), ["001#1122334455667788_F"]);
+        assert!(frames("-L r -8", 200).iter().any(|frame| frame.contains('_')));
     }
 
     #[test]

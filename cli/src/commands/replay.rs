@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
+use anyhow::{Context, Error, bail};
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
-use cantap::wire::message::Mode;
+use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Address, Channel, Device, TraceEvent};
 
 use crate::channel_args::{self, ChannelArgs};
@@ -29,8 +29,11 @@ pub struct Args {
     #[arg(short, long)]
     device: Address,
     /// The trace; - for standard input.
-    #[arg(value_name = "FILE")]
-    input: PathBuf,
+    #[arg(value_name = "FILE", required_unless_present = "from")]
+    input: Option<PathBuf>,
+    /// The trace, as canplayer takes it.
+    #[arg(short = 'I', value_name = "FILE")]
+    from: Option<PathBuf>,
     /// Send what was captured on one channel on another, as canplayer: TO=FROM, such as can1=can0.
     #[arg(value_name = "TO=FROM", value_parser = mapping)]
     mapping: Vec<(Channel, u8)>,
@@ -39,9 +42,9 @@ pub struct Args {
     #[command(flatten)]
     read: ReadArgs,
     /// Play so many times, or i for ever.
-    #[arg(short, long = "loop", value_name = "N|i", default_value = "1", value_parser = rounds)]
+    #[arg(short = 'l', long = "loop", value_name = "N|i", default_value = "1", value_parser = rounds)]
     rounds: Rounds,
-    /// Shorten pauses that are longer than this.
+    /// Skip pauses that are longer than this.
     #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
     skip: Option<Duration>,
     /// Least time between two frames, in milliseconds.
@@ -54,8 +57,14 @@ pub struct Args {
     #[arg(long, default_value_t = 1.0, value_parser = speed)]
     speed: f64,
     /// End after so many frames.
-    #[arg(short = 'n', long)]
+    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
+    /// Wait for Enter before the first frame.
+    #[arg(short, long)]
+    interactive: bool,
+    /// Accepted as canplayer's: what this device sends does not come back to other programs of this computer anyway.
+    #[arg(short = 'x', hide = true)]
+    no_loopback: bool,
     /// Print each frame that was sent.
     #[arg(short, long)]
     verbose: bool,
@@ -102,30 +111,67 @@ fn mapping(text: &str) -> Result<(Channel, u8), String> {
     Ok((channel_args::channel(to)?, from.filter(|from| *from > 0).ok_or_else(wrong)?))
 }
 
+/// The device's channels. One that nothing is sent on is never opened: it would acknowledge on a bus that is none of the
+/// trace's business, perhaps at another bit rate.
+struct Buses<'d> {
+    device: &'d Device,
+    /// Not opened yet, and how they will be.
+    closed: Vec<(Channel, ChannelConfig)>,
+}
+
+impl Buses<'_> {
+    /// Opens a channel before its first frame.
+    fn open(&mut self, channel: Channel) -> anyhow::Result<()> {
+        if let Some(at) = self.closed.iter().position(|(closed, _)| *closed == channel) {
+            let (_, config) = self.closed.swap_remove(at);
+            self.device
+                .open_channel(channel, Some(config))
+                .with_context(|| format!("channel {}", channel.number()))?;
+        }
+        Ok(())
+    }
+}
+
+fn wait_for_enter() -> anyhow::Result<()> {
+    eprintln!("cantap: press Enter to start");
+    std::io::stdin().read_line(&mut String::new()).context("standard input cannot be read")?;
+    Ok(())
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
+    let source = args.source()?;
     // What is wrong with the file is found before anything is opened.
-    if args.input.as_os_str() != "-" {
-        drop(args.read.open(&args.input)?);
+    if source.input.as_os_str() != "-" {
+        drop(args.read.open(&source.input)?);
     } else if args.rounds != Rounds::Times(1) {
         bail!("standard input can be played once only; give a file to repeat it");
+    } else if args.interactive {
+        bail!("standard input cannot bring both the trace and Enter; give a file with --interactive");
     }
     let device = Device::open(&args.device)?;
     let mut bitrates_bps = [0; CHANNELS];
-    for (channel, config) in args.open.open(&device, args.channels().into_iter(), Mode::Normal, None)? {
+    let mut buses =
+        Buses { device: &device, closed: args.open.configs(&device, source.channels(), Mode::Normal)? };
+    for (channel, config) in &buses.closed {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
+    }
+    if args.interactive {
+        wait_for_enter()?;
     }
     let pace = Pace {
         speed: args.speed,
         longest_gap: args.skip,
         shortest_gap: Duration::from_secs_f64(args.gap / 1e3),
+        burst: 1,
         ignore_times: args.ignore_times,
     };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut tally = Tally::new(!args.verbose);
     let mut bus = BusWatch::new(&device, args.open.rescue(&device));
-    let (started, left_out) = (Instant::now(), args.play(&mut replay, &mut tally, &mut bus)?);
+    let (started, left_out) =
+        (Instant::now(), args.play(&source, &mut replay, &mut tally, &mut bus, &mut buses)?);
     // The last frames may be due long after the others.
     replay.finish(|_| bus.goes_on())?;
     tally.add(&replay.take_ended())?;
@@ -163,7 +209,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-impl Args {
+/// What is played, and where to.
+struct Source {
+    input: PathBuf,
+    mapping: Vec<(Channel, u8)>,
+}
+
+impl Source {
     /// Channels that something may be sent on.
     fn channels(&self) -> Vec<Channel> {
         if self.mapping.is_empty() {
@@ -178,13 +230,33 @@ impl Args {
         }
         self.mapping.iter().find(|(_, source)| *source == from).map(|(to, _)| *to)
     }
+}
+
+impl Args {
+    fn source(&self) -> anyhow::Result<Source> {
+        let mut mapping = self.mapping.clone();
+        let input = match (&self.from, &self.input) {
+            (Some(from), first) => {
+                // With -I the first word is a mapping too.
+                if let Some(word) = first {
+                    mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(Error::msg)?);
+                }
+                from.clone()
+            }
+            (None, Some(input)) => input.clone(),
+            (None, None) => PathBuf::from("-"),
+        };
+        Ok(Source { input, mapping })
+    }
 
     /// Hands the trace to the device. Returns how many frames were left out.
     fn play(
         &self,
+        source: &Source,
         replay: &mut Replay<'_>,
         tally: &mut Tally,
         bus: &mut BusWatch<'_>,
+        buses: &mut Buses<'_>,
     ) -> anyhow::Result<u64> {
         let (mut pushed, mut left_out) = (0_u64, 0);
         // A round begins where the one before ended.
@@ -193,18 +265,19 @@ impl Args {
         loop {
             let mut first_ns = None;
             let mut last_ns = 0;
-            let mut records = self.read.open(&self.input)?;
+            let mut records = self.read.open(&source.input)?;
             while let Some(record) = records.next()? {
                 let TraceEvent::Frame { frame, .. } = record.event else {
                     continue;
                 };
-                let Some(channel) = self.target(record.channel) else {
+                let Some(channel) = source.target(record.channel) else {
                     left_out += 1;
                     continue;
                 };
                 if self.frames.is_some_and(|frames| pushed >= frames) {
                     return Ok(left_out);
                 }
+                buses.open(channel)?;
                 let first_ns = *first_ns.get_or_insert(record.time_ns);
                 last_ns = record.time_ns - first_ns + shift_ns;
                 if !replay.push(last_ns, channel, frame, || bus.goes_on())? {
@@ -218,7 +291,7 @@ impl Args {
             if first_ns.is_none() {
                 bail!(
                     "'{}' has no frame to send; see `cantap replay --help` for channels",
-                    self.input.display()
+                    source.input.display()
                 );
             }
             round += 1;

@@ -1,0 +1,102 @@
+//! `cantap update`, with and without dfu-util, and `cantap identify`, `reset`.
+#![cfg(unix)]
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A folder of this test's own, with a firmware image in it.
+fn folder(name: &str) -> (PathBuf, PathBuf) {
+    let folder = Path::new(env!("CARGO_TARGET_TMPDIR")).join(name);
+    let _ = std::fs::remove_dir_all(&folder);
+    std::fs::create_dir_all(&folder).unwrap();
+    let image = folder.join("it's a firmware.bin");
+    let words = [0x2002_0000_u32, 0x0800_0195, 0, 0];
+    std::fs::write(&image, words.map(u32::to_le_bytes).concat()).unwrap();
+    (folder, image)
+}
+
+/// Runs with nothing but this folder in the search path.
+fn cantap(path: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let Output { status, stdout, stderr } = command.args(arguments).env("PATH", path).output().unwrap();
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+/// A dfu-util that notes how it was called.
+fn fake_dfu_util(folder: &Path, exit_code: u8, mode: u32) {
+    let script =
+        format!("#!/bin/sh\nprintf '%s\\n' \"$@\" > '{}/called'\nexit {exit_code}\n", folder.display());
+    let path = folder.join("dfu-util");
+    std::fs::write(&path, script).unwrap();
+    std::fs::set_permissions(&path, std::fs::Permissions::from_mode(mode)).unwrap();
+}
+
+#[test]
+fn without_dfu_util_the_line_to_run_is_printed_ready_for_a_shell() {
+    let (folder, image) = folder("no-dfu-util");
+    let (code, out, err) = cantap(&folder, &["update", "-d", "virtual", image.to_str().unwrap()]);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let line = out.lines().last().unwrap().trim();
+    assert!(out.contains("Install dfu-util") && line.starts_with("dfu-util -d 0483:df11 "), "{out}");
+    // The printed line does what the command would have done.
+    fake_dfu_util(&folder, 0, 0o755);
+    let run = Command::new("/bin/sh").args(["-c", line]).env("PATH", &folder).status().unwrap();
+    assert!(run.success());
+    let called = std::fs::read_to_string(folder.join("called")).unwrap();
+    assert_eq!(called.lines().last(), image.to_str());
+}
+
+#[test]
+fn dfu_util_writes_the_image_where_it_is_installed() {
+    let (folder, image) = folder("dfu-util");
+    fake_dfu_util(&folder, 0, 0o755);
+    let (code, out, err) = cantap(&folder, &["update", "-d", "virtual", image.to_str().unwrap()]);
+    assert_eq!((code, out.as_str(), err.as_str()), (Some(0), "", ""));
+    let called = std::fs::read_to_string(folder.join("called")).unwrap();
+    let arguments = format!("-d\n0483:df11\n-a\n0\n-s\n0x08000000:leave\n-w\n-D\n{}\n", image.display());
+    assert_eq!(called, arguments);
+}
+
+#[test]
+fn a_dfu_util_that_fails_or_cannot_start_is_told_with_the_line_to_repeat() {
+    let (folder, image) = folder("failing-dfu-util");
+    fake_dfu_util(&folder, 74, 0o755);
+    let (code, _, err) = cantap(&folder, &["update", "-d", "virtual", image.to_str().unwrap()]);
+    assert!(code == Some(1) && err.contains("dfu-util failed") && err.contains("dfu-util -d 0483"), "{err}");
+    fake_dfu_util(&folder, 0, 0o644);
+    let (code, out, _) = cantap(&folder, &["update", "-d", "virtual", image.to_str().unwrap()]);
+    assert!(code == Some(0) && out.contains("cannot be started"), "{out}");
+}
+
+#[test]
+fn what_is_no_image_never_brings_the_device_out_of_its_firmware() {
+    let (folder, _) = folder("no-image");
+    let other = folder.join("other.bin");
+    for (content, part) in [
+        (b"\x7FELF and more".as_slice(), "ELF"),
+        (b"short", "too short"),
+        (b"a text that is long enough to have two words", "no firmware image"),
+    ] {
+        std::fs::write(&other, content).unwrap();
+        // There is no such device: an open would be told first.
+        let (code, _, err) = cantap(&folder, &["update", "-d", "/dev/nowhere", other.to_str().unwrap()]);
+        assert!(code == Some(1) && err.contains(part), "{err}");
+    }
+    let (code, _, err) = cantap(&folder, &["update", "-d", "virtual", "nowhere.bin"]);
+    assert!(code == Some(1) && err.contains("cannot read 'nowhere.bin'"), "{err}");
+}
+
+#[test]
+fn identify_and_reset_say_what_they_did_and_refuse_nonsense() {
+    let (folder, _) = folder("care");
+    assert_eq!(cantap(&folder, &["identify", "-d", "virtual"]).1, "its LEDs blink for 5 s\n");
+    assert_eq!(cantap(&folder, &["reset", "-d", "virtual"]), (Some(0), "restarting\n".into(), String::new()));
+    for line in [["identify", "-d", "virtual", "-s", "0"], ["identify", "-d", "virtual", "-s", "256"]] {
+        assert_eq!(cantap(&folder, &line).0, Some(2), "{line:?}");
+    }
+    for command in ["identify", "reset"] {
+        let (code, _, err) = cantap(&folder, &[command, "-d", "/dev/nowhere"]);
+        assert!(code == Some(1) && err.contains("cantap list"), "{err}");
+    }
+}

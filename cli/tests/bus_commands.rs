@@ -103,6 +103,39 @@ fn status_has_the_documented_keys() {
 }
 
 #[test]
+fn status_tells_of_a_bus_that_it_listened_to() {
+    let line = "status -d virtual:errors=40,load=60,frames=std8 -b 500k --time 300ms --json";
+    let (code, out, err) = cantap(line);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+    for channel in object["channels"].as_array().unwrap() {
+        assert_eq!(
+            (&channel["open"], &channel["tec"], &channel["rec"]),
+            (&true.into(), &0.into(), &0.into())
+        );
+        assert!(channel["frames"].as_u64() > Some(50) && channel["bus_errors"].as_u64() > Some(20), "{out}");
+        assert!(channel["last_error"].is_string(), "{out}");
+    }
+    // In normal mode its counters count, and the registers at the last error are known.
+    let line =
+        "status -d virtual:errors=95,load=100,frames=std8 -c 1 -b 500k -t 300ms --mode normal --registers";
+    let (code, out, err) = cantap(line);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(
+        out.contains("channel 1    open, Normal, 500000 bit/s") && out.contains("channel 2    closed"),
+        "{out}"
+    );
+    // A frame in twenty is good, and takes it back from passive for a moment.
+    let passive_or_nearly = ["passive", "warning"].map(|state| format!("state      {state}, TEC 0, REC 1"));
+    assert!(passive_or_nearly.iter().any(|line| out.contains(line)), "{out}");
+    let registers = out.split("registers of channel 1").nth(1).unwrap();
+    let esr = registers.lines().find(|line| line.contains("CAN_ESR")).unwrap();
+    assert!(!esr.trim_end().ends_with('-'), "{out}");
+    let (code, _, err) = cantap("status -d virtual -b 500k");
+    assert!(code == Some(1) && err.contains("add --time"), "{err}");
+}
+
+#[test]
 fn device_care_is_one_line_each() {
     for (line, out) in [
         ("identify -d virtual -s 2", "its LEDs blink for 2 s\n"),

@@ -2,22 +2,37 @@
 
 use std::io::Write;
 use std::process::ExitCode;
+use std::time::{Duration, Instant};
 
-use cantap::wire::message::{ChannelStatus, RegisterSet, Status};
+use anyhow::bail;
+use cantap::wire::message::{ChannelStatus, Mode, RegisterSet, Status};
 use cantap::wire::record::{BusErrorKind, ErrorState};
 use cantap::{Address, Channel, Device};
 use serde_json::{Value, json};
 
+use crate::channel_args::ChannelArgs;
+use crate::{args, interrupt};
+
 /// The command line.
 #[derive(clap::Args)]
 #[command(
-    after_help = "Connecting begins a session: it closes both channels and sets the counters to zero.\n\n\
-                        Examples:\n  cantap status -d /dev/ttyACM0\n  cantap status -d virtual --registers --json"
+    after_help = "Connecting begins a session: it closes both channels and sets the counters to zero. So to learn something of a \
+                        bus, listen to it for a while first, with --time.\n\n\
+                        Examples:\n  cantap status -d /dev/ttyACM0\n  cantap status -d /dev/ttyACM0 -b 500k --time 2s\n  \
+                        cantap status -d virtual --registers --json"
 )]
 pub struct Args {
     /// Where the device is: a serial port, or virtual.
     #[arg(short, long)]
     device: Address,
+    /// Open the channels for so long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
+    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    time: Option<Duration>,
+    /// Which channels --time opens: 1, 2 or both.
+    #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels)]
+    channel: args::Channels,
+    #[command(flatten)]
+    open: ChannelArgs,
     /// The controllers' registers too, now and at the last error.
     #[arg(long)]
     registers: bool,
@@ -26,9 +41,24 @@ pub struct Args {
     json: bool,
 }
 
+/// How often Ctrl-C is looked for.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    interrupt::watch()?;
     let device = Device::open(&args.device)?;
+    if let Some(time) = args.time {
+        args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&[]))?;
+        let mut rescue = args.open.rescue(&device);
+        let ends = Instant::now() + time;
+        while Instant::now() < ends && !interrupt::requested() {
+            std::thread::sleep(LOOK_EVERY.min(ends.saturating_duration_since(Instant::now())));
+            rescue.look()?;
+        }
+    } else if args.open.timing.is_given() {
+        bail!("a bit rate alone opens nothing; add --time to listen for so long before asking");
+    }
     let status = device.status()?;
     let mut registers = Vec::new();
     if args.registers {

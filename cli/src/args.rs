@@ -44,10 +44,12 @@ pub fn positive_duration(text: &str) -> Result<Duration, String> {
     if duration.is_zero() { Err("give a time longer than zero".to_owned()) } else { Ok(duration) }
 }
 
-/// A share in per cent, 0 to 100.
+/// A share in per cent, above 0 and up to 100.
 pub fn percent(text: &str) -> Result<f64, String> {
     let number = text.trim_end_matches('%').trim_end().parse::<f64>().ok();
-    number.filter(|number| (0.0..=100.0).contains(number)).ok_or_else(|| "give per cent, 0 to 100".to_owned())
+    number
+        .filter(|number| *number > 0.0 && *number <= 100.0)
+        .ok_or_else(|| "give per cent, above 0 and up to 100".to_owned())
 }
 
 /// Channels of a device, as `1`, `2` or `both`.

@@ -1,5 +1,21 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
 
+/// Standard error may be closed or full, and std's macro panics then. Whoever does not read what went wrong still gets the exit code.
+macro_rules! eprintln {
+    ($($part:tt)*) => {{
+        use std::io::Write as _;
+        let _ = writeln!(std::io::stderr(), $($part)*);
+    }};
+}
+
+/// As `eprintln`.
+macro_rules! eprint {
+    ($($part:tt)*) => {{
+        use std::io::Write as _;
+        let _ = write!(std::io::stderr(), $($part)*);
+    }};
+}
+
 mod args;
 mod channel_args;
 mod channel_bitrate;

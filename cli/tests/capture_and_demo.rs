@@ -160,6 +160,7 @@ fn what_cannot_work_is_one_line_with_the_next_step() {
     }
     assert_eq!(cantap("capture -d virtual").0, Some(2));
     assert_eq!(cantap("demo --load 101").0, Some(2));
+    assert_eq!(cantap("demo --load 0").0, Some(2));
     assert_eq!(cantap("capture -d virtual -b 1M -n 0").0, Some(2));
     assert_eq!(cantap("capture -d virtual -b 1M -t 0").0, Some(2));
 }
@@ -184,6 +185,17 @@ fn a_capture_that_outgrows_its_place_says_how_many_frames_the_file_has() {
     let captured = &summary["channels"];
     let captured = captured[0]["frames"].as_u64().unwrap() + captured[1]["frames"].as_u64().unwrap();
     assert!(captured > text.lines().count() as u64, "{summary}");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn messages_that_nobody_can_take_change_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let full = std::fs::OpenOptions::new().write(true).open("/dev/full").unwrap();
+    let mut capture = command("capture -d virtual:load=50 -b 1M -n 10 -o some.log");
+    let status = capture.current_dir(folder.path()).stderr(full).status().unwrap();
+    assert_eq!(status.code(), Some(0));
+    assert_eq!(std::fs::read_to_string(folder.path().join("some.log")).unwrap().lines().count(), 10);
 }
 
 #[cfg(target_os = "linux")]

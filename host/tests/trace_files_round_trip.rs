@@ -7,7 +7,7 @@ mod testing;
 mod traces;
 
 use cantap::formats::{
-    CsvDialect, DifConvention, Format, LineEnd, TableStyle, TrcVersion, WriteOptions, create_writer,
+    CsvDialect, DifConvention, Format, LeftOut, LineEnd, TableStyle, TrcVersion, WriteOptions, create_writer,
 };
 // `testing` takes them from here.
 use cantap::{Direction, TraceEvent, TraceRecord};
@@ -21,6 +21,22 @@ fn resolution_ns(format: Format) -> i64 {
         Format::Trc(TrcVersion::V1_1) => 100_000,
         Format::Candump | Format::Asc | Format::Trc(_) => 1000,
         Format::Blf | Format::Csv(_) | Format::Pcapng | Format::Dif => 1,
+    }
+}
+
+/// Whether records or parts of them are missing from a file, which the number of its rows is not.
+fn lacks_records(left_out: &LeftOut) -> bool {
+    left_out.iter().any(|(what, _)| !what.starts_with("the number of rows"))
+}
+
+#[test]
+fn a_number_of_rows_that_cannot_be_written_afterwards_is_named() {
+    let directory = directory("totals");
+    for (name, named) in [("a.dif", 0), ("a.dif.gz", 1), ("a.blf", 0), ("a.blf.zst", 0), ("a.log.gz", 0)] {
+        let path = directory.join(name);
+        let left_out = write(&path, Format::of_path(&path).unwrap(), &real(10));
+        let counts = left_out.iter().filter(|(what, _)| what.starts_with("the number of rows")).count();
+        assert_eq!(counts, named, "{name}: {left_out:?}");
     }
 }
 
@@ -42,7 +58,7 @@ fn real_traffic_survives_every_format_plain_and_compressed() {
                 let expected = TraceRecord { time_ns: record.time_ns, ..*original };
                 assert_eq!(*record, expected, "{}", path.display());
             }
-            assert_eq!(left_out.is_empty(), records == written, "{}: {left_out:?}", path.display());
+            assert_eq!(!lacks_records(&left_out), records == written, "{}: {left_out:?}", path.display());
         }
     }
 }
@@ -62,7 +78,7 @@ proptest! {
             let left_out = write(&path, format, &records);
             let (read, issues) = read(&path);
             prop_assert_eq!(issues, Vec::<String>::new(), "{}", format);
-            prop_assert_eq!(left_out.is_empty(), read == records, "{}: {:?}\n{:?}\n{:?}", format, left_out, read, records);
+            prop_assert_eq!(!lacks_records(&left_out), read == records, "{}: {:?}\n{:?}\n{:?}", format, left_out, read, records);
         }
     }
 

@@ -45,7 +45,7 @@ pub struct Args {
     /// several.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<Filter>,
-    /// File to write; its suffix picks the format. Without a suffix it is a candump log.
+    /// File to write; its suffix picks the format, if --format does not. Without a suffix it is a candump log.
     #[arg(short, long)]
     output: Option<PathBuf>,
     /// End after so many frames.
@@ -256,7 +256,8 @@ fn implied_format(path: &Path) -> Option<Format> {
 fn frames_in_file(args: &Args) -> Option<u64> {
     let is_one = args.write.rotate.is_empty() && args.trigger.trigger.is_none();
     let path = args.output.as_deref().filter(|path| is_one && path.is_file())?;
-    let options = ReadOptions { format: implied_format(path), ..ReadOptions::default() };
+    let format = args.write.options(implied_format(path)).ok()?.format;
+    let options = ReadOptions { format, ..ReadOptions::default() };
     let records = open_reader(path, &options).ok()?.filter_map(Result::ok);
     Some(records.filter(|record| record.frame().is_some()).count() as u64)
 }

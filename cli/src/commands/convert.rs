@@ -35,10 +35,6 @@ pub struct Args {
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Any of several.
     #[arg(value_name = "FILTER")]
     filters: Vec<Filter>,
-    /// The format of OUT, where its name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
-    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, dif.
-    #[arg(long, visible_alias = "to", value_name = "FORMAT")]
-    format: Option<Format>,
     /// The format of IN, where neither its name nor its beginning tell.
     #[arg(long, value_name = "FORMAT")]
     from: Option<Format>,
@@ -70,6 +66,10 @@ pub struct Args {
 /// How to write; for other commands to flatten too.
 #[derive(clap::Args)]
 pub struct WriteArgs {
+    /// The format to write, where the file's name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
+    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, dif.
+    #[arg(long, visible_alias = "to", value_name = "FORMAT")]
+    format: Option<Format>,
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
     #[arg(long, value_name = "SIZE|TIME")]
     pub rotate: Vec<RotateAt>,
@@ -101,8 +101,8 @@ fn character(text: &str) -> Result<u8, String> {
 }
 
 impl WriteArgs {
-    /// The library's options.
-    pub fn options(&self, format: Option<Format>) -> anyhow::Result<WriteOptions> {
+    /// The library's options, with the format of a file whose name does not tell it.
+    pub fn options(&self, implied: Option<Format>) -> anyhow::Result<WriteOptions> {
         if self.separator == self.decimal_mark {
             bail!("the separator and the decimal mark are the same character; choose different ones");
         }
@@ -110,7 +110,7 @@ impl WriteArgs {
         let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
         let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
         let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
-        Ok(WriteOptions { format, rotation, table })
+        Ok(WriteOptions { format: self.format.or(implied), rotation, table })
     }
 }
 
@@ -129,7 +129,7 @@ pub fn report(left_out: &LeftOut, path: &Path) {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
-    let options = args.write.options(args.format)?;
+    let options = args.write.options(None)?;
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter };
     let mut records = read.open(&args.input)?;

@@ -58,6 +58,10 @@ impl DifLayout {
     }
 }
 
+/// What a stream or a compressed file lacks.
+pub(super) const ROWS_UNTOLD: &str =
+    "the number of rows in its head, which only a plain file can be given afterwards";
+
 impl Layout for DifLayout {
     fn head(&mut self, date: &str, out: &mut Vec<u8>) {
         // The start stands in the title, as it does in a comment of the analyser's CSV.
@@ -106,7 +110,7 @@ impl Layout for DifLayout {
     fn patch(&self, rows: u64) -> Option<Patch> {
         // One more for the names of the columns.
         let count = format!("{:0COUNT_DIGITS$}", rows + 1);
-        self.count_at.map(|offset| Patch { offset, bytes: count.into_bytes() })
+        self.count_at.map(|offset| Patch { offset, bytes: count.into_bytes(), missed: Some(ROWS_UNTOLD) })
     }
 }
 

@@ -109,13 +109,22 @@ impl Input {
         let head = input.peek(4)?;
         if head.starts_with(&[0x1F, 0x8B]) {
             let decoder = flate2::read::MultiGzDecoder::new(input.into_rest());
-            return Ok(Self::new(Box::new(decoder), false));
+            return Self::new(Box::new(decoder), false).without_byte_order_mark();
         }
         if head.starts_with(&[0x28, 0xB5, 0x2F, 0xFD]) {
             let decoder = zstd::stream::read::Decoder::new(input.into_rest())?;
-            return Ok(Self::new(Box::new(decoder), false));
+            return Self::new(Box::new(decoder), false).without_byte_order_mark();
         }
-        Ok(input)
+        input.without_byte_order_mark()
+    }
+
+    /// Passes over UTF-8's byte order mark, which some editors put in front of a text.
+    fn without_byte_order_mark(mut self) -> io::Result<Self> {
+        const MARK: &[u8] = &[0xEF, 0xBB, 0xBF];
+        if self.peek(MARK.len())?.starts_with(MARK) {
+            self.consume(MARK.len());
+        }
+        Ok(self)
     }
 
     /// What was buffered and all that follows, as a reader.
@@ -279,6 +288,15 @@ mod tests {
             [(1, "a".into(), true), (2, String::new(), true), (3, "b".into(), true), (4, "c".into(), false)];
         assert_eq!(lines(input("a\n\r\nb\r\nc")), expected);
         assert_eq!(lines(input("")), []);
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_no_part_of_the_first_line() {
+        let text = "\u{feff}a\nb\n";
+        let zstd = zstd::stream::encode_all(text.as_bytes(), 1).unwrap();
+        for bytes in [text.as_bytes().to_vec(), zstd] {
+            assert_eq!(lines(input(bytes)), [(1, "a".into(), true), (2, "b".into(), true)]);
+        }
     }
 
     #[test]

@@ -27,6 +27,8 @@ pub(crate) struct Patch {
     pub offset: u64,
     /// What shall stand there.
     pub bytes: Vec<u8>,
+    /// What other programs miss where it cannot be done.
+    pub missed: Option<&'static str>,
 }
 
 impl Output {

@@ -61,7 +61,9 @@ pub(crate) fn read(format: Format, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>
 pub(crate) fn round_trip(format: Format, records: &[TraceRecord]) -> Vec<TraceRecord> {
     let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
     let (bytes, left_out) = write_with(&options, records);
-    assert_eq!(left_out, LeftOut::default());
+    // What is written here is no plain file.
+    let left_out = left_out.iter().find(|(what, _)| *what != super::dif::ROWS_UNTOLD);
+    assert_eq!(left_out, None);
     let (records, issues) = read(format, bytes);
     assert_eq!(issues, Vec::<String>::new());
     records

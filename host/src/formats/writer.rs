@@ -196,11 +196,11 @@ impl FileWriter {
         result
     }
 
-    fn patch(&mut self) -> io::Result<()> {
-        if let Some(patch) = self.encoder.patch(self.written) {
-            self.output.patch(&patch)?;
-        }
-        Ok(())
+    /// Brings the head up to date; returns what other programs miss in it where that cannot be done.
+    fn patch(&mut self) -> io::Result<Option<&'static str>> {
+        let Some(patch) = self.encoder.patch(self.written) else { return Ok(None) };
+        let patched = self.output.patch(&patch)?;
+        Ok(patch.missed.filter(|_| !patched))
     }
 }
 
@@ -226,7 +226,9 @@ impl TraceWriter for FileWriter {
         let result = self.output.write(&self.buffer, |bytes| self.encoder.whole(bytes));
         self.written += self.buffer.len() as u64;
         result?;
-        self.patch()?;
+        if let Some(what) = self.patch()? {
+            self.left_out.note(what);
+        }
         self.output.finish()?;
         Ok(self.left_out)
     }

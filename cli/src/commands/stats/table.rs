@@ -122,7 +122,7 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     }
     if !channel.peaks.is_empty() {
         out.push_str("  busiest windows\n");
-        let zero_s = channel.first_s.unwrap_or(0.0);
+        let zero_s = channel.first_s.or(summary.first_s).unwrap_or(0.0);
         for window in &channel.peaks {
             let _ = writeln!(out, "{}", window_line(window, zero_s));
         }

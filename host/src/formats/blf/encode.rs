@@ -235,7 +235,7 @@ impl Encode for Encoder {
     }
 
     fn patch(&self, written: u64) -> Option<Patch> {
-        self.started.then(|| Patch { offset: 0, bytes: self.file_header(written) })
+        self.started.then(|| Patch { offset: 0, bytes: self.file_header(written), missed: None })
     }
 
     fn whole(&self, _bytes: &[u8]) -> usize {

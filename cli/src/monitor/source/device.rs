@@ -149,6 +149,7 @@ impl Source<'_> {
     /// Takes what comes and follows orders, until one ends the session.
     fn listen(&mut self, device: &Device, records: &mut Records, clock: &UtcClock) -> anyhow::Result<Then> {
         let mut next_figures = Instant::now();
+        let mut pace = None;
         loop {
             match records.next_batch(WAIT)? {
                 Some(batch) => self.hand_over(batch, records),
@@ -157,6 +158,10 @@ impl Source<'_> {
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;
                 let status = device.status()?;
+                let now_ns = clock.at(Instant::now());
+                let pace =
+                    pace.get_or_insert_with(|| Pace::new(now_ns, status.ticks, device.hello().tick_hz));
+                let now_ns = pace.now_ns(now_ns, status.ticks);
                 let mut model = lock(self.model);
                 if let Some(figures) = &mut model.seen.device {
                     figures.status = Some(status);
@@ -164,7 +169,7 @@ impl Source<'_> {
                     figures.clock = Some(device.clock());
                 }
                 // What is still on the way must not find its window closed.
-                model.advance(clock.at(Instant::now()).saturating_sub(LATENESS_NS));
+                model.advance(now_ns.saturating_sub(LATENESS_NS));
                 drop(model);
                 self.show_recording();
             }
@@ -223,6 +228,32 @@ impl Source<'_> {
     }
 }
 
+/// How a device's time passes: with the computer's, or, where it does not run in real time (an emulated board), behind it.
+struct Pace {
+    start_ns: i64,
+    start_ticks: u64,
+    tick_hz: u32,
+}
+
+impl Pace {
+    /// A request's round trip, and what a busy computer adds.
+    const JITTER_NS: i64 = 500_000_000;
+
+    fn new(start_ns: i64, start_ticks: u64, tick_hz: u32) -> Self {
+        Self { start_ns, start_ticks, tick_hz: tick_hz.max(1) }
+    }
+
+    /// The time on the device, which told `ticks` at `utc_ns`: the computer's, unless the device is more behind than a
+    /// crystal can be.
+    fn now_ns(&self, utc_ns: i64, ticks: u64) -> i64 {
+        let ticks = u128::from(ticks.saturating_sub(self.start_ticks));
+        let passed_ns = (ticks * 1_000_000_000 / u128::from(self.tick_hz)) as i64;
+        let expected_ns = utc_ns.saturating_sub(self.start_ns);
+        let is_behind = passed_ns < expected_ns - expected_ns / 100 - Self::JITTER_NS;
+        if is_behind { self.start_ns.saturating_add(passed_ns) } else { utc_ns }
+    }
+}
+
 fn periodic(tick_hz: u32, frame: Frame, period: Duration) -> Periodic {
     let ticks = period.as_nanos() * u128::from(tick_hz) / 1_000_000_000;
     Periodic {
@@ -230,5 +261,25 @@ fn periodic(tick_hz: u32, frame: Frame, period: Duration) -> Periodic {
         period_ticks: u32::try_from(ticks).unwrap_or(u32::MAX),
         count: 0,
         modifiers: heapless::Vec::new(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const S: i64 = 1_000_000_000;
+
+    #[test]
+    fn a_device_that_lags_behind_tells_the_time_itself() {
+        let pace = Pace::new(1000 * S, 12_000_000, 12_000_000);
+        let at = |utc_s: i64, device_s: u64| pace.now_ns(utc_s * S, 12_000_000 * (1 + device_s)) / S;
+        // A real one: drift and round trips do not matter, not for days.
+        assert_eq!(at(1000, 0), 1000);
+        assert_eq!(at(1000 + 100_000, 99_990), 101_000);
+        assert_eq!(at(1000 + 100_000, 100_010), 101_000);
+        // An emulated one at half the speed.
+        assert_eq!(at(1010, 5), 1005);
+        assert_eq!(at(1100, 50), 1050);
     }
 }

@@ -76,7 +76,7 @@ fn line(random: &mut fastrand::Rng) -> &'static str {
 }
 
 fn record(random: &mut fastrand::Rng, now_ns: &mut i64) -> TraceRecord {
-    let wild = random.u32(..200) == 0;
+    let wild = random.u32(..2000) == 0;
     *now_ns = if wild { random.i64(..) } else { now_ns.saturating_add(random.i64(-1000..2_000_000_000)) };
     let counters = random.bool().then(|| (random.u8(..), random.u8(..)));
     let event = match random.u32(..12) {

@@ -8,6 +8,9 @@ use super::super::model::{Model, SourceState};
 use super::super::theme::Theme;
 use super::bytes;
 
+/// Characters of an address that there is room for beside the rest.
+const MOST_ADDRESS: usize = 32;
+
 /// Source, load per channel, recording, filters.
 pub fn line(app: &App, model: &Model) -> Line<'static> {
     let theme = app.theme;
@@ -18,7 +21,7 @@ pub fn line(app: &App, model: &Model) -> Line<'static> {
             Mode::Loopback => "loopback",
             Mode::SilentLoopback => "silent loopback",
         };
-        format!("{} {mode}", plan.address)
+        format!("{} {mode}", end_of(&plan.address.to_string()))
     });
     let style = match model.source {
         SourceState::Gone(_) => theme.error(),
@@ -49,6 +52,15 @@ pub fn line(app: &App, model: &Model) -> Line<'static> {
         spans.push(Span::styled("  FILTER", Theme::heading()));
     }
     Line::from(spans)
+}
+
+/// The end of a long address, where its name is.
+fn end_of(address: &str) -> String {
+    let hidden = address.chars().count().saturating_sub(MOST_ADDRESS);
+    if hidden == 0 {
+        return address.to_owned();
+    }
+    std::iter::once('…').chain(address.chars().skip(hidden + 1)).collect()
 }
 
 /// How the source is, in words for the second line.

@@ -1,4 +1,4 @@
-//! What the firmware's ELF does on request: filters, bit rates, replies, periods, times, load, slcan.
+//! What the firmware's ELF does on request: filters, bit rates, replies, periods.
 
 mod common;
 
@@ -128,32 +128,4 @@ fn every_cia_rate_is_heard_and_its_double_is_not() {
         }
         assert_eq!(rig.dominant_bits(Can1), 0, "a listener that drives the bus");
     }
-}
-
-#[test]
-fn slcan_talks_over_the_same_port() {
-    let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, Setup::default(), Timing::hasty());
-    rig.plug_in().unwrap();
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(500_000)));
-    for (line, answer) in [
-        ("\r\r", "\r\r"),
-        ("V\r", "V1001\r"),
-        ("C\r", "\r"),
-        ("S6\r", "\r"),
-        ("t1230\r", "\x07"),
-        ("O\r", "\r"),
-        ("t1232DEAD\r", "z\r"),
-        ("T1ABBCCDD3112233\r", "Z\r"),
-        ("F\r", "F00\r"),
-    ] {
-        rig.with_host(|host, _| host.send(line.as_bytes()));
-        let heard = rig.run_unbooked(4 * MS).unwrap();
-        assert_eq!(String::from_utf8_lossy(&heard), answer, "the answer to {line:?}");
-    }
-    let from = rig.now() + MS;
-    let sender = Script::new(vec![(from, "7FF#0102".parse().unwrap())]);
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(500_000)).with_source(sender));
-    let heard = rig.run_unbooked(4 * MS).unwrap();
-    assert_eq!(String::from_utf8_lossy(&heard), "t7FF20102\r");
 }

@@ -88,6 +88,10 @@ pub trait Client {
     fn receive(&self) -> io::Result<Vec<u8>>;
     /// Takes as many of the bytes as it can and says how many.
     fn deliver(&self, bytes: &[u8]) -> io::Result<usize>;
+    /// Whether somebody has the port open, as of the last [`Self::receive`].
+    fn is_open(&self) -> bool {
+        true
+    }
 }
 
 #[cfg(unix)]
@@ -98,6 +102,10 @@ impl Client for crate::pty::Pty {
 
     fn deliver(&self, bytes: &[u8]) -> io::Result<usize> {
         self.write(bytes)
+    }
+
+    fn is_open(&self) -> bool {
+        self.has_client()
     }
 }
 
@@ -112,6 +120,10 @@ pub struct Served {
     /// When the first of the channels that are open was opened: what is replayed begins then.
     origin: u64,
     waiting: VecDeque<u8>,
+    /// From the client, until the device knows that its port is open.
+    to_device: Vec<u8>,
+    /// Whether a client has the port open.
+    attended: bool,
 }
 
 impl Served {
@@ -136,7 +148,8 @@ impl Served {
         }
         let witness = Arc::default();
         let (open, origin, waiting) = ([None; CHANNELS], 0, VecDeque::new());
-        Ok(Self { rig, manner, options, witness, open, origin, waiting })
+        let (to_device, attended) = (Vec::new(), true);
+        Ok(Self { rig, manner, options, witness, open, origin, waiting, to_device, attended })
     }
 
     /// Whether the buses' traffic goes on whoever opens and closes the channels.
@@ -211,8 +224,10 @@ impl Served {
         self.testify(crossed);
         self.follow_channels();
         self.waiting.extend(bytes);
-        // The client cannot see a device that comes back by itself after a reset: its port stays.
-        self.rig.with_host(|host, _| host.open_port());
+        if self.attended {
+            // The client cannot see a device that comes back by itself after a reset: its port stays.
+            self.rig.with_host(|host, _| host.open_port());
+        }
         Ok(())
     }
 
@@ -230,8 +245,19 @@ impl Served {
 
     /// Moves bytes in both directions.
     fn hand_over(&mut self, client: &impl Client) -> io::Result<()> {
-        let bytes = client.receive()?;
-        if !bytes.is_empty() {
+        self.to_device.extend(client.receive()?);
+        let open = client.is_open();
+        if open != self.attended {
+            self.attended = open;
+            self.rig.with_host(|host, _| if open { host.open_port() } else { host.close_port() });
+        }
+        if !open {
+            self.to_device.clear();
+            self.waiting.clear();
+            return Ok(());
+        }
+        if !self.to_device.is_empty() && self.rig.with_host(|host, _| host.port_ready()) {
+            let bytes = std::mem::take(&mut self.to_device);
             self.rig.with_host(|host, _| host.send(&bytes));
         }
         while !self.waiting.is_empty() {

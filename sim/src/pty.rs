@@ -3,6 +3,7 @@
 
 use std::io;
 use std::os::fd::OwnedFd;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 use rustix::fs::{Mode, OFlags};
 use rustix::io::Errno;
@@ -16,10 +17,9 @@ const PIECE: usize = 4096;
 #[derive(Debug)]
 pub struct Pty {
     master: OwnedFd,
-    /// Keeps the terminal alive between two clients: with no slave open at all, reads of the master
-    /// fail and its settings are lost.
-    _slave: OwnedFd,
     name: String,
+    /// Whether a client had it open when it was last read.
+    has_client: AtomicBool,
 }
 
 impl Pty {
@@ -38,7 +38,9 @@ impl Pty {
         let status = rustix::fs::fcntl_getfl(&master)?;
         rustix::fs::fcntl_setfl(&master, status | OFlags::NONBLOCK)?;
         let name = path.into_string().map_err(|_| io::Error::other("the terminal's name is not text"))?;
-        Ok(Self { master, _slave: slave, name })
+        // With no other end open, reading says so; that is how the last client's close is seen. The settings stay.
+        drop(slave);
+        Ok(Self { master, name, has_client: AtomicBool::new(false) })
     }
 
     /// The name that clients open.
@@ -49,9 +51,16 @@ impl Pty {
     /// Takes what clients wrote, without waiting.
     pub fn read(&self) -> io::Result<Vec<u8>> {
         let mut bytes = vec![0; PIECE];
-        let len = or_nothing(rustix::io::read(&self.master, &mut bytes[..]))?;
+        let read = rustix::io::read(&self.master, &mut bytes[..]);
+        self.has_client.store(read != Err(Errno::IO), Ordering::Relaxed);
+        let len = or_nothing(read)?;
         bytes.truncate(len);
         Ok(bytes)
+    }
+
+    /// Whether a client had the terminal open when it was last read.
+    pub fn has_client(&self) -> bool {
+        self.has_client.load(Ordering::Relaxed)
     }
 
     /// Writes as much as the terminal takes and returns how much that was.
@@ -60,11 +69,11 @@ impl Pty {
     }
 }
 
-/// A terminal that is not ready moved nothing.
+/// A terminal that is not ready, or that nobody has open, moved nothing.
 fn or_nothing(result: Result<usize, Errno>) -> io::Result<usize> {
     match result {
         Ok(len) => Ok(len),
-        Err(Errno::AGAIN | Errno::INTR) => Ok(0),
+        Err(Errno::AGAIN | Errno::INTR | Errno::IO) => Ok(0),
         Err(error) => Err(error.into()),
     }
 }
@@ -76,11 +85,12 @@ mod tests {
     use std::io::{Read, Write};
 
     #[test]
-    fn bytes_pass_unchanged_and_a_second_client_finds_the_port_open() {
+    fn bytes_pass_unchanged_and_each_client_is_seen_to_come_and_go() {
         let pty = Pty::open().unwrap();
         let all: Vec<u8> = (0..=255).collect();
         for _ in 0..2 {
             let mut client = File::options().read(true).write(true).open(pty.name()).unwrap();
+            assert_eq!((pty.read().unwrap(), pty.has_client()), (vec![], true));
             assert_eq!(pty.write(&all).unwrap(), all.len());
             let mut read = vec![0; all.len()];
             client.read_exact(&mut read).unwrap();
@@ -91,13 +101,15 @@ mod tests {
                 got.extend(pty.read().unwrap());
             }
             assert_eq!(got, all);
+            drop(client);
+            assert_eq!((pty.read().unwrap(), pty.has_client()), (vec![], false));
         }
-        assert_eq!(pty.read().unwrap(), b"");
     }
 
     #[test]
     fn a_terminal_that_nobody_reads_takes_no_more_at_some_point() {
         let pty = Pty::open().unwrap();
+        let _client = File::options().read(true).write(true).open(pty.name()).unwrap();
         let filled =
             (0..10_000).try_for_each(|_| if pty.write(&[0; PIECE]).unwrap() == 0 { Err(()) } else { Ok(()) });
         assert_eq!(filled, Err(()));

@@ -131,6 +131,44 @@ fn a_served_device_talks_to_whoever_reads_and_writes() {
     assert_eq!(session.corruptions(), []);
 }
 
+/// A client that is killed closes the port as any other: the channel leaves the bus, and the next client finds it closed.
+#[cfg(unix)]
+#[test]
+fn a_pty_whose_client_is_gone_leaves_the_bus() {
+    use std::fs::File;
+    use std::io::{BufRead, BufReader, Read, Write};
+    use std::process::Stdio;
+
+    let Some(elf) = common::elf() else { return };
+    let mut server = Command::new(env!("CARGO_BIN_EXE_cantap-sim"))
+        .args(["run", elf.to_str().unwrap(), "--pty", "--load", "5"])
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut name = String::new();
+    BufReader::new(server.stdout.take().unwrap()).read_line(&mut name).unwrap();
+    let open = || File::options().read(true).write(true).open(name.trim()).unwrap();
+    // An slcan channel that receives, and nobody who closes it.
+    let mut first = open();
+    first.write_all(b"\rS6\rO\r").unwrap();
+    let mut heard = Vec::new();
+    while !heard.windows(2).any(|pair: &[u8]| pair == b"\rt" || pair == b"\rT") {
+        let mut piece = [0; 64];
+        let len = first.read(&mut piece).unwrap();
+        heard.extend(&piece[..len]);
+    }
+    drop(first);
+    std::thread::sleep(Duration::from_millis(300));
+    // `S` is refused on an open channel.
+    let mut second = open();
+    second.write_all(b"S5\r").unwrap();
+    let mut answer = [0; 1];
+    second.read_exact(&mut answer).unwrap();
+    server.kill().unwrap();
+    server.wait().unwrap();
+    assert_eq!(answer, *b"\r");
+}
+
 /// Served on a pseudo-terminal, it is a serial port like any other.
 #[cfg(unix)]
 #[test]

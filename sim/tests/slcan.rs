@@ -158,6 +158,15 @@ fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refus
     }
 }
 
+/// What can-utils' `slcand -o -c -f -s6` writes before it asks the kernel for the line discipline.
+#[test]
+fn slcands_opening_opens_the_channel() {
+    let Some(mut rig) = plugged_in() else { return };
+    converse(&mut rig, &[("C\rS6\rF\rO\r", "\r\r\x07\r")]);
+    on_the_bus(&mut rig, &["123#"]);
+    assert_eq!(text(rig.run_unbooked(4 * MS).unwrap()), "t1230\r");
+}
+
 /// Frames that the controller's FIFO dropped, because its interrupt came too late.
 #[test]
 fn an_overrun_sets_the_data_overrun_flag_once() {
@@ -223,6 +232,10 @@ print("done")
 
         fn deliver(&self, bytes: &[u8]) -> io::Result<usize> {
             self.0.write(bytes)
+        }
+
+        fn is_open(&self) -> bool {
+            self.0.has_client()
         }
     }
 

@@ -52,7 +52,7 @@ pub struct Args {
     /// The firmware's ELF, as `cargo xtask firmware` makes it.
     firmware: PathBuf,
     /// Emulated seconds of traffic. Without, 1, or the length of what is replayed; a PTY is served without end.
-    #[arg(long, value_parser = seconds)]
+    #[arg(long, value_parser = some_seconds)]
     seconds: Option<Duration>,
     /// Bus load in per cent.
     #[arg(long, value_name = "PCT", default_value = "100", value_parser = percent)]
@@ -114,6 +114,11 @@ fn seconds(text: &str) -> Result<Duration, String> {
     };
     let value = number.parse::<f64>().ok().and_then(|value| Duration::try_from_secs_f64(value * factor).ok());
     value.ok_or_else(|| "give a time as a number and a unit, such as 400ms".to_owned())
+}
+
+/// A time that is not nothing.
+fn some_seconds(text: &str) -> Result<Duration, String> {
+    seconds(text).and_then(|time| if time.is_zero() { Err("give more than 0".to_owned()) } else { Ok(time) })
 }
 
 fn percent(text: &str) -> Result<f64, String> {

@@ -238,7 +238,8 @@ fn channel_report(rig: &Rig, channel: Channel, seconds: f64, bitrate_bps: u32) -
         delivered: rig.ledger.delivered_count(channel),
         lost: rig.ledger.losses(channel),
         frames_per_s: sent as f64 / seconds,
-        bus_load_pct: 100.0 * bits / (seconds * f64::from(bitrate_bps)),
+        // The last frame may have ended after the traffic's time.
+        bus_load_pct: (100.0 * bits / (seconds * f64::from(bitrate_bps))).min(100.0),
     }
 }
 

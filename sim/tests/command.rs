@@ -90,7 +90,9 @@ fn bad_input_is_told_in_one_line_that_names_it() {
         assert!(message.starts_with("cantap-sim: ") && message.contains(what), "{message}");
         assert_eq!(message.lines().count(), 1, "{message}");
     }
-    assert_eq!(run(&elf, &["--frames", "fd"]).status.code(), Some(2));
+    for wrong in [["--frames", "fd"], ["--seconds", "0"], ["--load", "101"], ["--channels", "3"]] {
+        assert_eq!(run(&elf, &wrong).status.code(), Some(2), "{wrong:?}");
+    }
 }
 
 /// The device as a byte stream in this process, as the host library uses it.

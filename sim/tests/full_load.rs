@@ -129,6 +129,23 @@ fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
     }
 }
 
+/// One channel fills the queue in 0.94 s.
+#[test]
+fn a_stall_of_more_than_a_second_on_one_channel_loses_what_does_not_fit_and_counts_it() {
+    let options = Options {
+        stall: Some(Duration::from_millis(1200)),
+        channels: vec![Channel::Can1],
+        ..at_full_load(Kind::Std0, 1.4)
+    };
+    let Some(report) = capture(&options) else { return };
+    let channel = &report.channels[0];
+    // A quarter of a second of frames, 48 us each.
+    assert!((4_500..7_500).contains(&channel.lost.queue), "{channel:?}");
+    assert_eq!((channel.lost.controller, channel.lost.link), (0, 0));
+    assert_eq!(channel.sent, channel.delivered + channel.lost.queue);
+    assert!(report.queue_high_water_bytes <= report.queue_bytes);
+}
+
 /// 2 packets of 64 bytes in a frame are 128 kB/s; two channels of this kind make 230 kB/s.
 #[test]
 fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {

@@ -8,8 +8,9 @@ use cantap_sim::rig::{MS, Rig};
 use cantap_sim::stream::{Replayed, fill, join, replay};
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::Timing;
-use cantap_wire::Channel;
 use cantap_wire::Channel::{Can1, Can2};
+use cantap_wire::message::{MAX_SEND, TxFrame};
+use cantap_wire::{Channel, Command, Event};
 
 const MEGABIT: u32 = 1_000_000;
 
@@ -94,4 +95,32 @@ fn two_streams_at_once_lose_and_reorder_nothing() {
     let filled = fill(&mut rig, &[Can1, Can2], Kind::Std8, 0.2).unwrap().expect("all frames in order");
     eprintln!("{filled:?}");
     assert!(filled.iter().all(|one| one.load_percent >= 75.0), "{filled:?}");
+}
+
+/// A full record queue has no room for confirmations. What is due then waits for room; an alarm that came again and again would
+/// keep USB from making it.
+#[test]
+fn timed_frames_that_cannot_be_confirmed_do_not_keep_the_host_out() {
+    let Some(mut rig) = joined(&[Can1]) else { return };
+    saturate(&mut rig, Can2, 1_150);
+    let now = rig.now() - rig.clock_origin();
+    let at = |n: u64| Some((now + 1_050 * MS) / 12 + n * 12_000);
+    let frames: Vec<TxFrame> = (0..64)
+        .map(|n| TxFrame { tag: n, frame: "123#55".parse().unwrap(), at_ticks: at(n.into()) })
+        .collect();
+    for frames in frames.chunks(MAX_SEND) {
+        rig.ask(Command::Send { channel: Can1, frames: frames.iter().copied().collect() }).unwrap();
+    }
+    rig.with_host(|host, _| host.read(false));
+    rig.run_for(1_130 * MS).unwrap();
+    rig.with_host(|host, _| host.read(true));
+    rig.run_for(300 * MS).unwrap();
+    let confirmed =
+        rig.events().iter().filter(|(_, event)| matches!(event, Event::Transmitted { .. })).count();
+    assert_eq!(confirmed, frames.len());
+    for channel in Channel::ALL {
+        rig.close(channel).unwrap();
+    }
+    assert!(rig.ledger.losses(Can2).queue > 1_000, "{:?}", rig.ledger.losses(Can2));
+    assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
 }

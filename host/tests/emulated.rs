@@ -2,33 +2,26 @@
 //! (`emu:`): what one answers the other must answer too, and both capture the same log alike.
 #![cfg(all(feature = "emu", feature = "virtual"))]
 
-use std::path::{Path, PathBuf};
+#[path = "../../sim/tests/common/mod.rs"]
+mod common;
+
+use std::sync::PoisonError;
 use std::time::Duration;
 
-use cantap::device::Address;
+use cantap::bits_on_bus;
+use cantap::device::{Address, Link};
+use cantap::replay::{Pace, Replay};
 use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Hello, Mode, TxFrame};
 use cantap::wire::{BitTiming, Command, Frame, Refusal, Reply};
 use cantap::{Channel, Device, DeviceError};
+use cantap_sim::bus::Member;
 
 const CHANNEL: Channel = Channel::Can1;
 const BITRATE_BPS: u32 = 500_000;
 
-/// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it.
-fn elf() -> Option<PathBuf> {
-    if let Some(path) = std::env::var_os("CANTAP_FIRMWARE_ELF") {
-        return Some(PathBuf::from(path));
-    }
-    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/firmware/cantap-olimex-p405.elf");
-    if built.exists() {
-        return Some(built);
-    }
-    eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware` first", built.display());
-    None
-}
-
 /// The virtual and the emulated device with the same options.
 fn both(options: &str) -> Option<[Device; 2]> {
-    let emulated = format!("emu:{},{options}", elf()?.display());
+    let emulated = format!("emu:{},{options}", common::elf()?.display());
     let addresses = [format!("virtual:{options}"), emulated];
     Some(addresses.map(|address| Device::open(&address.parse::<Address>().unwrap()).unwrap()))
 }
@@ -169,5 +162,62 @@ fn both_devices_capture_a_log_alike() {
         let apart = (native.2 - one[0].2) - (emulated.2 - other[0].2);
         // The emulated device's clock is mapped to a wall clock that it does not keep up with.
         assert!(apart.abs() < 20_000, "{native:?} and {emulated:?}");
+    }
+}
+
+/// The whole way: the host's stream, the emulated USB, the firmware's alarm, the bus. Time is slow, so that a busy machine is
+/// no slow host.
+#[test]
+fn a_replay_keeps_the_traces_spacing_and_order_on_the_elf() {
+    const MEGABIT: u32 = 1_000_000;
+    const CYCLES_PER_US: f64 = 144.0;
+    let Some(elf) = common::elf() else { return };
+    for load_percent in [30.0, 90.0] {
+        let mut address: cantap_sim::address::Address =
+            format!("{},load=0,speed=0.1", elf.display()).parse().unwrap();
+        address.manner.witness = true;
+        let port = address.open().unwrap();
+        let witness = port.device.witness();
+        let link = Link::new(port.reader, port.writer).keeping(port.device);
+        let device = Device::over(link, "emulated").unwrap();
+        let timing = device.timing(MEGABIT).unwrap();
+        let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing) };
+        device.open_channel(CHANNEL, Some(config)).unwrap();
+        let mut replay = Replay::new(&device, Pace::default(), [MEGABIT; 2]).unwrap();
+        let mut begin_us = 0.0;
+        let mut planned = Vec::new();
+        for n in 0..600_u64 {
+            let frame: Frame = match n % 3 {
+                0 => format!("{:03X}#{n:016X}", n % 0x7FF),
+                1 => format!("{:08X}#{n:08X}", n * 0x0012_3457 % 0x1FFF_FFFF),
+                _ => format!("{:03X}#R{}", 0x7FF - n % 0x700, n % 9),
+            }
+            .parse()
+            .unwrap();
+            let bits = f64::from(bits_on_bus(&frame));
+            planned.push((begin_us, frame));
+            // A trace's time is the end of a frame, without the three bits of the intermission.
+            let end_ns = ((begin_us + bits - 3.0) * 1000.0) as i64;
+            assert!(replay.push(end_ns, CHANNEL, frame, || true).unwrap());
+            begin_us += (bits * 100.0 / load_percent).ceil();
+        }
+        assert!(replay.finish(|since| since < Duration::from_secs(10)).unwrap());
+        let ended = replay.take_ended();
+        assert!(ended.len() == planned.len() && ended.iter().all(|end| end.result.is_ok()));
+        assert!(ended.iter().map(|end| end.tag).eq(0..planned.len() as u32));
+        let accuracy = replay.accuracy();
+        drop(replay);
+        drop(device);
+        let seen = witness.lock().unwrap_or_else(PoisonError::into_inner);
+        let ours =
+            seen.frames[CHANNEL.index()].iter().filter(|crossed| crossed.sender == Member::Controller(0));
+        let crossed: Vec<(f64, Frame)> =
+            ours.map(|crossed| (crossed.start as f64 / CYCLES_PER_US, crossed.frame)).collect();
+        assert!(crossed.iter().map(|(_, frame)| frame).eq(planned.iter().map(|(_, frame)| frame)));
+        let late = crossed.iter().zip(&planned).map(|((start, _), (begin, _))| start - begin);
+        let (least, most) = late.fold((f64::MAX, f64::MIN), |(a, b), us| (a.min(us), b.max(us)));
+        eprintln!("at {load_percent} %: spacing {:.2} us, by the confirmations {accuracy:?}", most - least);
+        assert!(most - least <= 2.0, "at {load_percent} %: {} us", most - least);
+        assert!(accuracy.early_us <= 3.5 && accuracy.late_us <= 3.5, "{accuracy:?}");
     }
 }

@@ -83,6 +83,19 @@ fn a_signal_ends_it_with_the_terminal_given_back_and_the_recording_whole() {
     }
 }
 
+#[test]
+fn a_window_that_is_closed_ends_it_with_the_recording_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("trace.blf");
+    let mut view = Terminal::start(&format!("{BUSY} -o {}", file.display()), (120, 24));
+    view.wait_for("REC");
+    std::thread::sleep(std::time::Duration::from_millis(300));
+    view.close();
+    // By itself, or by an error that nobody can read.
+    view.end();
+    check_complete(&file);
+}
+
 /// Every record can be read, and nothing was lost.
 fn check_complete(file: &Path) {
     let records = open_reader(file, &ReadOptions::default()).unwrap();

@@ -2,6 +2,7 @@
 //! depend on either.
 
 pub mod app;
+mod keyboard;
 pub mod model;
 pub mod picture;
 pub mod profile;
@@ -25,6 +26,7 @@ use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
 use crate::interrupt;
 use app::{App, Flow};
+use keyboard::{Keyboard, Waited};
 use model::{Model, SourceState};
 use screen::Screen;
 use source::{Order, Origin, Shared, lock};
@@ -67,7 +69,7 @@ fn start(
     std::thread::Builder::new().name("cantap-source".to_owned()).spawn(body)
 }
 
-/// Until the user leaves, a signal asks for it, or there is no source any more.
+/// Until the user leaves, a signal asks for it, or there is no source or no terminal any more.
 fn display(
     screen: &mut Screen,
     app: &mut App,
@@ -75,13 +77,19 @@ fn display(
     is_over: impl Fn() -> bool,
 ) -> anyhow::Result<()> {
     let stops = Stops::watch()?;
+    let keyboard = Keyboard::new()?;
     while !interrupt::requested() && !is_over() {
         let drawn = Instant::now();
         screen.draw(app, model)?;
         let mut flow = if stops.asked() { Flow::Suspend } else { Flow::GoOn };
         // What happens meanwhile is answered at once.
         let mut wait = FRAME.saturating_sub(drawn.elapsed());
-        while flow == Flow::GoOn && event::poll(wait)? {
+        while flow == Flow::GoOn {
+            match keyboard.wait(wait)? {
+                Waited::Event => {}
+                Waited::Nothing => break,
+                Waited::Gone => return Ok(()),
+            }
             let event = event::read()?;
             let mut model = lock(model);
             match event {

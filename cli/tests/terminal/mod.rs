@@ -15,10 +15,11 @@ const PATIENCE: Duration = Duration::from_mins(1);
 /// A running `cantap` and its terminal.
 pub struct Terminal {
     child: Box<dyn Child + Send + Sync>,
-    master: Box<dyn MasterPty + Send>,
-    writer: Box<dyn Write + Send>,
+    /// Our end, and a way to type into it, until the window is closed.
+    ours: Option<(Box<dyn MasterPty + Send>, Box<dyn Write + Send>)>,
     parser: Arc<Mutex<vt100::Parser>>,
     stalled: Arc<AtomicBool>,
+    closed: Arc<AtomicBool>,
 }
 
 fn size((columns, rows): (u16, u16)) -> PtySize {
@@ -59,10 +60,11 @@ impl Terminal {
             .unwrap()
             .set_size(columns_rows.1.try_into().unwrap(), columns_rows.0.try_into().unwrap());
         let stalled = Arc::new(AtomicBool::new(false));
-        let (screen, waits) = (Arc::clone(&parser), Arc::clone(&stalled));
+        let closed = Arc::new(AtomicBool::new(false));
+        let (screen, waits, ends) = (Arc::clone(&parser), Arc::clone(&stalled), Arc::clone(&closed));
         std::thread::spawn(move || {
             let mut bytes = [0; 4096];
-            loop {
+            while !ends.load(Ordering::Relaxed) {
                 while waits.load(Ordering::Relaxed) {
                     std::thread::sleep(Duration::from_millis(5));
                 }
@@ -73,13 +75,21 @@ impl Terminal {
             }
         });
         let writer = pair.master.take_writer().unwrap();
-        Self { child, master: pair.master, writer, parser, stalled }
+        Self { child, ours: Some((pair.master, writer)), parser, stalled, closed }
+    }
+
+    /// Closes the window: the program has no terminal any more.
+    pub fn close(&mut self) {
+        // The reader goes when it has read once more, and with it the last of our ends.
+        self.closed.store(true, Ordering::Relaxed);
+        self.ours = None;
     }
 
     /// Types.
     pub fn keys(&mut self, keys: &str) {
-        self.writer.write_all(keys.as_bytes()).unwrap();
-        self.writer.flush().unwrap();
+        let (_, writer) = self.ours.as_mut().unwrap();
+        writer.write_all(keys.as_bytes()).unwrap();
+        writer.flush().unwrap();
     }
 
     /// What stands on the screen.
@@ -114,7 +124,7 @@ impl Terminal {
     pub fn resize(&self, columns_rows: (u16, u16)) {
         let (columns, rows) = columns_rows;
         self.parser.lock().unwrap().set_size(rows.try_into().unwrap(), columns.try_into().unwrap());
-        self.master.resize(size(columns_rows)).unwrap();
+        self.ours.as_ref().unwrap().0.resize(size(columns_rows)).unwrap();
     }
 
     /// The terminal takes no more output, or takes it again.
@@ -130,7 +140,7 @@ impl Terminal {
 
     /// Whether the terminal waits for whole lines and shows them, as it does for a shell.
     pub fn is_as_a_shell_wants_it(&self) -> bool {
-        let local = format!("{:?}", self.master.get_termios().unwrap().local_flags);
+        let local = format!("{:?}", self.ours.as_ref().unwrap().0.get_termios().unwrap().local_flags);
         local.contains("ICANON") && local.contains("ECHO")
     }
 

@@ -113,7 +113,9 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
         None => match Format::of_path(path) {
             Ok(format) => format,
             Err(unknown) => {
-                let head = input.peek(64).map_err(failed)?;
+                // A pipe may give no more than a line for a long time.
+                let head =
+                    if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
                 match Format::of_content(head) {
                     Some(format) => format,
                     None if path.as_os_str() == "-" => Format::Candump,

@@ -25,6 +25,10 @@ pub const COMMON_BPS: [u32; 14] = [
 
 /// Good frames in a row that make a candidate.
 const GOOD_FRAMES: u32 = 4;
+/// Frames and errors that are weighed where there are both: a frame may have been destroyed at the right rate, too.
+const WEIGHED_FRAMES: u32 = 24;
+/// The right rate is wrong about fewer than one frame in so many.
+const FRAMES_PER_ERROR: u32 = 8;
 /// Frames and errors that are looked at where both tell something.
 const STUDY_FRAMES: u32 = 8;
 /// A rate at which a frame was heard is listened to for so long at least.
@@ -135,7 +139,9 @@ impl Default for Heard {
 
 impl Heard {
     const fn is_good(&self) -> bool {
+        let seen = self.frames + self.errors;
         self.frames >= GOOD_FRAMES && self.errors == 0
+            || seen >= WEIGHED_FRAMES && self.errors * FRAMES_PER_ERROR < seen
     }
 }
 
@@ -164,12 +170,18 @@ pub fn search(
     let started = search.device.time()?;
     let mut dwell = limits.dwell;
     loop {
-        // Traffic that is there and fits none of the common rates is worth the long scan.
+        // Traffic that is there and fits none of the common rates is worth the long scan. Before it they are tried
+        // again: what came first at the right one may have been a frame that was destroyed.
         let of = COMMON_BPS.len();
-        let common = COMMON_BPS.into_iter().enumerate();
-        let rates = common.map(|(at, bitrate_bps)| Progress::Common { bitrate_bps, at, of });
-        if let Some(found) = search.try_all(rates, dwell)? {
-            return Ok(found);
+        for _ in 0..2 {
+            let common = COMMON_BPS.into_iter().enumerate();
+            let rates = common.map(|(at, bitrate_bps)| Progress::Common { bitrate_bps, at, of });
+            if let Some(found) = search.try_all(rates, dwell)? {
+                return Ok(found);
+            }
+            if search.errors == 0 {
+                break;
+            }
         }
         if search.errors > 0 {
             let grid = scan_rates(device.hello().can_clock_hz);
@@ -214,7 +226,7 @@ impl Search<'_> {
                 return Ok(Some(Outcome::Stopped));
             }
             let Ok(timing) = self.device.timing(bitrate_bps) else { continue };
-            let heard = self.listen(timing, Purpose::Find, dwell)?;
+            let heard = self.find(timing, dwell)?;
             self.errors += u64::from(heard.errors);
             if heard.is_good()
                 && let Some(found) = self.make_sure(bitrate_bps, heard, dwell)?
@@ -230,8 +242,23 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
+    /// Listens with a timing whether it is the right one.
+    fn find(&mut self, timing: BitTiming, dwell: Duration) -> Result<Heard, DeviceError> {
+        let heard = self.listen(timing, Purpose::Find, dwell)?;
+        if heard.frames > 0 && heard.errors > 0 {
+            self.listen(timing, Purpose::Weigh, dwell)
+        } else {
+            Ok(heard)
+        }
+    }
+
     /// Listens with a timing until there is evidence or the time is over.
     fn listen(&mut self, timing: BitTiming, purpose: Purpose, dwell: Duration) -> Result<Heard, DeviceError> {
+        let clock_hz = self.device.hello().can_clock_hz;
+        if !(MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&timing.bitrate_bps(clock_hz)) {
+            // Beyond what a device opens. Nothing of the bus can be there either.
+            return Ok(Heard::default());
+        }
         let index = self.channel.index();
         let before = self.device.status()?.channels[index];
         while self.records.next_batch(Duration::ZERO)?.is_some_and(|batch| !batch.is_empty()) {}
@@ -250,6 +277,7 @@ impl Search<'_> {
                 // A wrong rate shows at once.
                 Purpose::Find => heard.errors > 0 || heard.frames >= GOOD_FRAMES,
                 Purpose::Doubt { frames } => heard.errors > 0 || heard.frames >= frames,
+                Purpose::Weigh => heard.errors + heard.frames >= WEIGHED_FRAMES,
                 Purpose::Study => heard.errors + heard.frames >= STUDY_FRAMES,
             };
             if enough || status.ticks.saturating_sub(started) > dwell {
@@ -318,7 +346,7 @@ impl Search<'_> {
         if COMMON_BPS.contains(&candidate_bps)
             && !too_slow
             && let Some(timing) = sharpest(clocks_of(clock_hz, rate))
-            && self.listen(timing, Purpose::Find, dwell)?.is_good()
+            && self.find(timing, dwell)?.is_good()
             && !self.is_slower_than(rate, dwell)?
         {
             return Ok(self.found(candidate_bps, heard));
@@ -358,7 +386,7 @@ impl Search<'_> {
         let Some(best_bps) = best else {
             return Ok(Some(Outcome::NoMatch { errors: self.errors, about_bps: Some(middle) }));
         };
-        let heard = self.listen(self.device.timing(best_bps)?, Purpose::Find, dwell)?;
+        let heard = self.find(self.device.timing(best_bps)?, dwell)?;
         Ok(if heard.is_good() { self.found(best_bps, heard) } else { None })
     }
 
@@ -411,6 +439,8 @@ impl Search<'_> {
 enum Purpose {
     /// Is it this one?
     Find,
+    /// Is it this one, though not all that is heard is good?
+    Weigh,
     /// Is it this one rather than the one that was heard?
     Doubt {
         /// Good ones that answer yes.
@@ -509,6 +539,14 @@ mod on_the_virtual_device {
             let Outcome::Found { bitrate_bps, .. } = outcome else { panic!("{bitrate}: {outcome:?}") };
             let off = f64::from(bitrate_bps) / f64::from(bitrate) - 1.0;
             assert!(off.abs() < 0.01 && !COMMON_BPS.contains(&bitrate_bps), "{bitrate}: {bitrate_bps}");
+        }
+    }
+
+    #[test]
+    fn a_bus_on_which_frames_are_destroyed_is_found_all_the_same() {
+        for seed in 1..=20 {
+            let (outcome, _) = search_on(&format!("bitrate=250k,load=50,errors=4,seed={seed}"));
+            assert!(matches!(outcome, Outcome::Found { bitrate_bps: 250_000, .. }), "{seed}: {outcome:?}");
         }
     }
 

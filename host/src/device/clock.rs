@@ -14,8 +14,13 @@ const SLOTS: usize = 30;
 const MIN_SPAN: Duration = Duration::from_secs(5);
 /// A device whose rate differs by more does not run in real time (an emulated one): it is not followed.
 const MAX_DRIFT_PPM: f64 = 1000.0;
+/// Drift is taken from samples that leave no more doubt of it, in parts per million: half of both round trips over the time
+/// between them. A busy computer's round trips say nothing of a crystal.
+const MAX_DOUBT_PPM: f64 = 200.0;
 /// An error of the mapping is worked off over this time.
 const CATCH_UP_NS: f64 = 30e9;
+/// But never so fast that intervals would suffer: what frames are apart matters more than what time it is.
+const MAX_CATCH_UP_PPM: f64 = 100.0;
 
 /// The computer's UTC clock, read once and continued with the monotonic one: a step of the system's
 /// clock in mid-capture moves no frame.
@@ -153,13 +158,17 @@ impl ClockMap {
             self.drift_ppm = None;
             return;
         }
-        self.drift_ppm = Some(drift_ppm);
-        let true_rate = self.nominal_ns_per_tick / (1.0 + drift_ppm * 1e-6);
+        let doubt_ppm = (first.round_trip_ns + last.round_trip_ns) as f64 / 2.0 / span_ns * 1e6;
+        if doubt_ppm <= MAX_DOUBT_PPM {
+            self.drift_ppm = Some(drift_ppm);
+        }
+        let true_rate = self.nominal_ns_per_tick / (1.0 + self.drift_ppm.unwrap_or(0.0) * 1e-6);
         // Where the line is at `now`, and where the best sample says it should be.
         let at_ns = self.utc_ns(now.ticks);
         let since_best = now.ticks.wrapping_sub(last.ticks) as i64 as f64;
         let error_ns = last.utc_ns as f64 + since_best * true_rate - at_ns as f64;
-        let correction = (error_ns / CATCH_UP_NS).clamp(-MAX_DRIFT_PPM * 1e-6, MAX_DRIFT_PPM * 1e-6);
+        let most = MAX_CATCH_UP_PPM * 1e-6;
+        let correction = (error_ns / CATCH_UP_NS).clamp(-most, most);
         self.from_ticks = now.ticks;
         self.from_ns = at_ns;
         self.ns_per_tick = true_rate * (1.0 + correction);
@@ -207,6 +216,27 @@ mod tests {
             assert!((measured - ppm).abs() < 3.0, "{measured} ppm for {ppm}");
             assert!(worst_ns < 500_000.0, "{worst_ns} ns off at {ppm} ppm");
             assert!(monotonic);
+        }
+    }
+
+    #[test]
+    fn a_busy_computer_does_not_stretch_the_time_between_frames() {
+        let ticks_at = |ns: i64| ((ns - START_NS) as f64 * 0.012) as u64 + 5_000_000;
+        let mut map = ClockMap::new(TICK_HZ, START_NS);
+        let mut times = Vec::new();
+        for second in 0..60 {
+            let asked = START_NS + second * 1_000_000_000;
+            // The answer takes up to 300 ms, and the device reads its clock anywhere in that.
+            let delay = 1_000_000 + (second * 7919 % 13) * 23_000_000;
+            map.add(ticks_at(asked + delay * (second * 31 % 11) / 11), asked, asked + delay);
+            if second == 0 {
+                map.settle();
+            }
+            times.push(map.utc_ns(ticks_at(START_NS + second * 1_000_000_000)));
+        }
+        for pair in times.windows(13) {
+            let off_ns = (pair[12] - pair[0] - 12_000_000_000).abs();
+            assert!(off_ns < 12_000 * 300, "{off_ns} ns in 12 s");
         }
     }
 

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use cantap::Device;
 use cantap::device::Transmission;
+use cantap::replay::Replay;
 use cantap::transmit::Stream;
 use cantap::wire::message::ChannelStatus;
 use cantap::wire::record::{ErrorState, TransmitFailure};
@@ -15,6 +16,9 @@ use crate::rescue::Rescue;
 
 /// A frame that nobody acknowledged for so long is given up.
 pub const GIVE_UP_AFTER: Duration = Duration::from_secs(1);
+
+/// How often is looked whether to go on.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Counts ends of transmissions, and prints them as candump would.
 #[derive(Default)]
@@ -112,6 +116,21 @@ impl<'d> BusWatch<'d> {
         }
         !interrupt::requested()
     }
+}
+
+/// Waits for the rest of a replay, which may be due long after the others, and adds each end up as it comes.
+pub fn see_out(replay: &mut Replay<'_>, tally: &mut Tally, bus: &mut BusWatch<'_>) -> anyhow::Result<()> {
+    let mut ended = |replay: &mut Replay<'_>, bus: &mut BusWatch<'_>| {
+        let ends = replay.take_ended();
+        bus.note(&ends);
+        tally.add(&ends)
+    };
+    replay.flush()?;
+    while replay.under_way() > 0 && bus.goes_on() {
+        replay.wait(LOOK_EVERY)?;
+        ended(replay, bus)?;
+    }
+    ended(replay, bus)
 }
 
 /// Waits for the rest of a stream, until nothing ends for [`GIVE_UP_AFTER`] or Ctrl-C, and adds it up.

@@ -376,3 +376,26 @@ fn filters_are_candumps() {
         assert!(code == Some(2) && err.contains("filter"), "{wrong}: {err}");
     }
 }
+
+#[test]
+fn a_frame_is_told_when_it_was_sent_and_not_when_all_were() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("pause.log");
+    // More than a day apart: no device takes the second one now.
+    std::fs::write(&log, "(0.000000) can0 123#01\n(90000.000000) can0 123#02\n").unwrap();
+    let mut replay = std::process::Command::new(env!("CARGO_BIN_EXE_cantap"))
+        .args(["replay", "-d", "virtual:load=0", "-b", "500k", "-v"])
+        .arg(&log)
+        .stdout(std::process::Stdio::piped())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let mut line = String::new();
+    std::io::BufRead::read_line(&mut std::io::BufReader::new(replay.stdout.take().unwrap()), &mut line)
+        .unwrap();
+    let runs_on = replay.try_wait().unwrap().is_none();
+    replay.kill().unwrap();
+    replay.wait().unwrap();
+    assert!(line.ends_with("can0 123#01 T\n"), "{line:?}");
+    assert!(runs_on, "it was to wait for the second frame");
+}

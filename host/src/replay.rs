@@ -16,6 +16,10 @@ use crate::{Device, DeviceError};
 
 /// From now to the first frame: time to fill the device's queue.
 const LEAD: Duration = Duration::from_millis(100);
+/// Frames due later than this wait in the host: a device takes none that is more than a day ahead.
+const MOST_AHEAD: Duration = Duration::from_hours(1);
+/// How often is looked whether to go on.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// How to change the trace's times.
 #[derive(Clone, Copy, Debug)]
@@ -111,7 +115,10 @@ pub struct Accuracy {
 
 /// A replay under way.
 pub struct Replay<'d> {
+    device: &'d Device,
     stream: Stream<'d>,
+    /// Later frames wait here until they are nearer.
+    horizon_ticks: u64,
     timetable: Timetable,
     tick_hz: u32,
     /// Planned ends of what is under way, per channel.
@@ -128,7 +135,9 @@ impl<'d> Replay<'d> {
         let lead = (LEAD.as_secs_f64() * f64::from(tick_hz)) as u64;
         let timetable = Timetable::new(pace, bitrates_bps, tick_hz, device.time()? + lead);
         Ok(Self {
+            device,
             stream: Stream::new(device),
+            horizon_ticks: 0,
             timetable,
             tick_hz,
             planned: Default::default(),
@@ -137,18 +146,34 @@ impl<'d> Replay<'d> {
         })
     }
 
-    /// Adds the trace's next frame. Waits while the device's queue is full; returns false if `go_on` said no meanwhile.
+    /// Adds the trace's next frame. Waits while the device's queue is full or the frame's time too far ahead; returns false if
+    /// `go_on` said no meanwhile. It is given what has ended, as far as that is told before the wait is over.
     pub fn push(
         &mut self,
         end_ns: i64,
         channel: Channel,
         frame: Frame,
-        go_on: impl FnMut() -> bool,
+        mut go_on: impl FnMut(Vec<Transmission>) -> bool,
     ) -> Result<bool, DeviceError> {
         let (begin, end) = self.timetable.next(end_ns, channel, &frame);
         let ignore_times = self.timetable.pace.ignore_times;
         let at = (!ignore_times).then_some(begin);
-        let Some(tag) = self.stream.push(channel, frame, at, go_on)? else { return Ok(false) };
+        let horizon = MOST_AHEAD.as_secs() * u64::from(self.tick_hz);
+        if !ignore_times && begin > self.horizon_ticks {
+            // Nothing may stay here meanwhile.
+            self.stream.flush()?;
+            loop {
+                self.horizon_ticks = self.device.time()? + horizon;
+                if begin <= self.horizon_ticks {
+                    break;
+                }
+                self.stream.wait(LOOK_EVERY)?;
+                if !go_on(self.take_ended()) {
+                    return Ok(false);
+                }
+            }
+        }
+        let Some(tag) = self.stream.push(channel, frame, at, || go_on(Vec::new()))? else { return Ok(false) };
         if !ignore_times {
             self.planned[channel.index()].push_back((tag, end));
         }
@@ -158,6 +183,16 @@ impl<'d> Replay<'d> {
     /// Waits for the rest; see [`Stream::finish`].
     pub fn finish(&mut self, go_on: impl FnMut(Duration) -> bool) -> Result<bool, DeviceError> {
         self.stream.finish(go_on)
+    }
+
+    /// Hands everything to the device.
+    pub fn flush(&mut self) -> Result<(), DeviceError> {
+        self.stream.flush()
+    }
+
+    /// Waits for the next end of a transmission, at most so long.
+    pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
+        self.stream.wait(at_most)
     }
 
     /// Frames handed over that have not ended.

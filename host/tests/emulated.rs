@@ -198,7 +198,7 @@ fn a_replay_keeps_the_traces_spacing_and_order_on_the_elf() {
             planned.push((begin_us, frame));
             // A trace's time is the end of a frame, without the three bits of the intermission.
             let end_ns = ((begin_us + bits - 3.0) * 1000.0) as i64;
-            assert!(replay.push(end_ns, CHANNEL, frame, || true).unwrap());
+            assert!(replay.push(end_ns, CHANNEL, frame, |_| true).unwrap());
             begin_us += (bits * 100.0 / load_percent).ceil();
         }
         assert!(replay.finish(|since| since < Duration::from_secs(10)).unwrap());

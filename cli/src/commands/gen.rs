@@ -11,7 +11,7 @@ use cantap::{Address, Channel, Device, Frame, Id};
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::interrupt;
-use crate::sending::{BusWatch, Tally};
+use crate::sending::{self, BusWatch, Tally};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -219,17 +219,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
     while args.frames.is_none_or(|frames| generator.count < frames) {
         let frame = generator.frame();
-        if !bus.goes_on() || !replay.push(0, args.channel, frame, || bus.goes_on())? {
+        if !bus.goes_on() || !replay.push(0, args.channel, frame, |_| bus.goes_on())? {
             break;
         }
         let ends = replay.take_ended();
         bus.note(&ends);
         tally.add(&ends)?;
     }
-    if !interrupt::requested() {
-        replay.finish(|_| bus.goes_on())?;
-    }
-    tally.add(&replay.take_ended())?;
+    sending::see_out(&mut replay, &mut tally, &mut bus)?;
     let waiting = replay.under_way();
     device.stop()?;
     eprintln!("cantap: {} frames sent", tally.sent);

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Error, bail};
+use cantap::device::Transmission;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
@@ -13,7 +14,7 @@ use cantap::{Address, Channel, Device, TraceEvent};
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::input::ReadArgs;
-use crate::sending::{BusWatch, Tally};
+use crate::sending::{self, BusWatch, Tally};
 use crate::{args, interrupt};
 
 /// The command line.
@@ -173,8 +174,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (started, left_out) =
         (Instant::now(), args.play(&source, &mut replay, &mut tally, &mut bus, &mut buses)?);
     // The last frames may be due long after the others.
-    replay.finish(|_| bus.goes_on())?;
-    tally.add(&replay.take_ended())?;
+    sending::see_out(&mut replay, &mut tally, &mut bus)?;
     let waiting = replay.under_way();
     let seconds = started.elapsed().as_secs_f64();
     device.stop()?;
@@ -280,7 +280,15 @@ impl Args {
                 buses.open(channel)?;
                 let first_ns = *first_ns.get_or_insert(record.time_ns);
                 last_ns = record.time_ns - first_ns + shift_ns;
-                if !replay.push(last_ns, channel, frame, || bus.goes_on())? {
+                let mut told = Ok(());
+                let go_on = |ends: Vec<Transmission>| {
+                    bus.note(&ends);
+                    told = tally.add(&ends);
+                    told.is_ok() && bus.goes_on()
+                };
+                let goes_on = replay.push(last_ns, channel, frame, go_on)?;
+                told?;
+                if !goes_on {
                     return Ok(left_out);
                 }
                 pushed += 1;

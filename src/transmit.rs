@@ -376,8 +376,9 @@ impl Transmitter {
                 periodic.waiting = true;
                 let period = u64::from(periodic.entry.period_ticks.max(1));
                 periodic.next_due += period;
-                // Far behind (the bus was blocked): due times stay multiples of the period.
+                // Far behind (the bus was blocked): due times stay multiples of the period. No record for each, but all are counted.
                 if let Some(behind) = now.checked_sub(periodic.next_due + period * 4) {
+                    self.failed = self.failed.wrapping_add((behind / period) as u32);
                     periodic.next_due += behind / period * period;
                 }
             }

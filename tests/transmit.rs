@@ -171,6 +171,14 @@ fn modifiers_count_check_and_randomise() {
     assert!(random.len() > 20, "{random:?}");
 }
 
+/// Transmissions of channel 1 that failed, as the status counts them.
+fn failures<const N: usize>(bench: &mut Bench<'_, N>) -> u32 {
+    match bench.ask(Command::Status).unwrap() {
+        Reply::Status(status) => status.channels[0].transmit_failures,
+        other => panic!("{other:?}"),
+    }
+}
+
 /// A bus that takes nothing must neither stop the count nor pile frames up.
 #[test]
 fn a_period_that_passes_unsent_is_told() {
@@ -187,6 +195,16 @@ fn a_period_that_passes_unsent_is_told() {
     assert_eq!(outcomes(&bench), vec![(DEVICE_TAG + 1, Some(TransmitFailure::Overtaken)); 3]);
     let sent: Vec<Frame> = std::iter::from_fn(|| bench.send_one(CAN1)).collect();
     assert_eq!(sent.len(), 4);
+    // A second in which nobody looks: of its 100 periods one is loaded at once and one waits behind it.
+    let before = failures(&mut bench);
+    bench.pass(1000 * cantap_firmware::TICKS_PER_MS);
+    bench.millisecond();
+    bench.alarm();
+    assert!(
+        (98..=100).contains(&(failures(&mut bench) - before)),
+        "{} of 100",
+        failures(&mut bench) - before
+    );
 }
 
 #[test]

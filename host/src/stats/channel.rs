@@ -3,7 +3,8 @@
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 
 use super::ids::{IdStatistics, Ids};
-use super::load::{Window, Windows, WorkLoad, per_second};
+use super::windows::{Window, Windows, per_second};
+use super::work_load::WorkLoad;
 use crate::bits::bits_on_bus;
 use crate::{Direction, Frame, Id, TraceEvent, TraceRecord};
 

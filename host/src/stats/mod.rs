@@ -6,8 +6,9 @@
 
 mod channel;
 mod ids;
-mod load;
 mod summary;
+mod windows;
+mod work_load;
 
 use std::time::Duration;
 
@@ -16,8 +17,9 @@ use crate::bits::bits_on_bus;
 
 pub use channel::{ChannelStatistics, Errors, Losses};
 pub use ids::{IdStatistics, MOST_IDS, Period};
-pub use load::{ERROR_FRAME_BITS, Window, WorkLoad, shortest_window_ns};
 pub use summary::{ChannelSummary, ErrorSummary, IdSummary, LoadSummary, LossSummary, PeakSummary, Summary};
+pub use windows::{ERROR_FRAME_BITS, Window, shortest_window_ns};
+pub use work_load::WorkLoad;
 
 /// What to measure with.
 #[derive(Clone, Debug)]
@@ -136,7 +138,7 @@ impl Statistics {
         let origin_ns = *self.first_ns.get_or_insert_with(|| match (record.frame(), bitrate) {
             (Some(frame), Some(bitrate)) => {
                 let bits = bits_on_bus(frame) - crate::bits::INTERMISSION_BITS;
-                record.time_ns.saturating_sub(load::bits_to_ns(u64::from(bits), bitrate) as i64)
+                record.time_ns.saturating_sub(windows::bits_to_ns(u64::from(bits), bitrate) as i64)
             }
             _ => record.time_ns,
         });

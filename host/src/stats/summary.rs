@@ -233,7 +233,7 @@ impl ChannelSummary {
         });
         // As for frames: the first frame's bits lie before the span.
         let span = channel.covered_ns();
-        let bits_per_s = super::load::per_second(channel.bits - channel.first_bits(), span);
+        let bits_per_s = super::windows::per_second(channel.bits - channel.first_bits(), span);
         Self {
             channel: channel.number,
             bitrate: channel.bitrate_bps,

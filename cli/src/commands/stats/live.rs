@@ -1,6 +1,5 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
-use std::fmt::Write as _;
 use std::io::{IsTerminal, Write};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -10,6 +9,7 @@ use cantap::stats::{Statistics, Window};
 use cantap::{Address, Device, TraceRecord};
 
 use super::Args;
+use super::table::remarks;
 use super::windows::Windows;
 use crate::interrupt;
 
@@ -108,21 +108,11 @@ fn line(window: &Window, colour: bool) -> String {
         50.0.. => ("\x1b[33m", "\x1b[0m"),
         _ => ("\x1b[32m", "\x1b[0m"),
     };
-    let mut text = format!(
+    let text = format!(
         "can{} {:>7.0} frames/s {:>8.0} bit/s {load:>5.1} % |{on}{bar:.<BAR_COLUMNS$}{off}|",
         window.channel,
         window.frames_per_s(),
         window.bits_per_s(),
     );
-    // Writing to a String cannot fail.
-    if window.errors > 0 {
-        let _ = write!(text, " {} errors", window.errors);
-    }
-    if window.lost > 0 {
-        let _ = write!(text, " {} lost", window.lost);
-    }
-    if window.incomplete {
-        text.push_str(", frames are missing");
-    }
-    text
+    text + &remarks(window.errors, window.lost, window.incomplete)
 }

@@ -142,23 +142,30 @@ fn listed(counts: &[(u64, &str)]) -> String {
 /// A window with its start relative to `zero_s`.
 pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
     let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
-    let mut line = format!(
+    let line = format!(
         "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
         window.channel,
         window.start_s - zero_s,
         window.frames_per_s,
         window.bits_per_s
     );
-    if window.errors > 0 {
-        let _ = write!(line, " {} errors", window.errors);
+    line + &remarks(window.errors, window.lost, window.incomplete)
+}
+
+/// What is not as it should be in a window, to be put behind its figures.
+pub(super) fn remarks(errors: u64, lost: u64, incomplete: bool) -> String {
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    if errors > 0 {
+        let _ = write!(text, " {errors} errors");
     }
-    if window.lost > 0 {
-        let _ = write!(line, " {} lost", window.lost);
+    if lost > 0 {
+        let _ = write!(text, " {lost} lost");
     }
-    if window.incomplete {
-        line.push_str(", frames are missing");
+    if incomplete {
+        text.push_str(", frames are missing");
     }
-    line
+    text
 }
 
 fn ids_text(ids: &[IdSummary], out: &mut String) {

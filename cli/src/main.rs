@@ -40,7 +40,8 @@ use clap::Parser;
 mod exit {
     /// Something failed; the message on stderr says what and what to do next.
     pub const FAILURE: u8 = 1;
-    // 2 is a wrong command line; clap uses it by itself.
+    /// A wrong command line; clap uses it by itself.
+    pub const WRONG_COMMAND_LINE: u8 = 2;
     /// A check did not hold.
     pub const CHECK_FAILED: u8 = 3;
 }
@@ -64,7 +65,11 @@ fn main() -> ExitCode {
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("cantap: {}", sentence(&error));
-            ExitCode::from(exit::FAILURE)
+            ExitCode::from(if is_wrong_command_line(&error) {
+                exit::WRONG_COMMAND_LINE
+            } else {
+                exit::FAILURE
+            })
         }
     }
 }
@@ -75,6 +80,11 @@ fn sentence(error: &anyhow::Error) -> String {
         let cause = cause.to_string();
         if text.contains(&cause) { text } else { format!("{text}: {cause}") }
     })
+}
+
+/// A condition is a part of the command line, though it is understood only when the databases have been read.
+fn is_wrong_command_line(error: &anyhow::Error) -> bool {
+    error.is::<cantap::condition::ConditionError>()
 }
 
 /// Whether it only says that nobody reads our output any more.

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use anyhow::anyhow;
+use anyhow::Context;
 use cantap::condition::Condition;
 use cantap::trigger::{Trigger, Window};
 
@@ -34,7 +34,7 @@ impl TriggerArgs {
     pub fn trigger(&self) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
         let decoder = self.databases.load(false)?;
-        let condition = Condition::new(text, &decoder).map_err(|error| anyhow!("--trigger: {error}"))?;
+        let condition = Condition::new(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =
             Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), once: self.once };

@@ -89,20 +89,20 @@ fn context_is_shown_as_grep_does() {
 }
 
 #[test]
-fn finding_nothing_ends_with_1_and_a_bad_condition_is_marked() {
+fn finding_nothing_ends_with_1_and_a_bad_condition_with_2_and_is_marked() {
     assert_eq!(
         cantap("nothing", &["search", "a.log", "--id", "7FF"]),
         (Some(1), String::new(), String::new())
     );
     let (code, _, err) = cantap("nothing", &["search", "a.log", "--db", "car.dbc", "Speed > and Gear"]);
-    assert_eq!(code, Some(1));
+    assert_eq!(code, Some(2));
     assert_eq!(
         err,
         "cantap: condition: expected a number, a signal, a part of the frame or \"(\", found \"and\"\n  \
          Speed > and Gear\n          ^\n"
     );
     let (code, _, err) = cantap("nothing", &["search", "a.log", "Speed > 3"]);
-    assert_eq!(code, Some(1));
+    assert_eq!(code, Some(2));
     assert!(err.contains("load one with --db"), "{err}");
     assert_eq!(cantap("nothing", &["search", "a.log"]).0, Some(1));
     assert_eq!(cantap("nothing", &["search", "a.log", "--id", "12345"]).0, Some(2));

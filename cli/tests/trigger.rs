@@ -50,7 +50,7 @@ fn once_ends_after_the_first_event() {
 fn a_condition_that_cannot_be_understood_ends_before_anything_is_written() {
     let (code, _, err) =
         cantap("wrong", &["capture", "--trigger", "Sped > 1", "--db", "car.dbc", "-o", "wrong.log"]);
-    assert_eq!(code, Some(1));
+    assert_eq!(code, Some(2));
     assert!(
         err.starts_with("cantap: --trigger: there is no signal \"Sped\"; did you mean Speed?\n"),
         "{err}"

@@ -5,7 +5,7 @@ use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use anyhow::anyhow;
+use anyhow::Context;
 use cantap::condition::Condition;
 use cantap::formats::{TraceWriter, WriteOptions, create_writer};
 use cantap::search::{DataPattern, IdPattern, Search};
@@ -83,7 +83,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let decoder = args.databases.load(args.read.strict)?;
     let text = args.condition.as_ref().or(args.positional.as_ref());
     let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
-    let condition = condition.map_err(|error| anyhow!("condition: {error}"))?;
+    let condition = condition.context("condition")?;
     if condition.is_none() && args.ids.is_empty() && args.data.is_empty() {
         anyhow::bail!("nothing to look for; give --id, --data or a condition (see cantap search --help)");
     }

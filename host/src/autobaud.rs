@@ -87,10 +87,8 @@ pub enum Outcome {
         bitrate_bps: u32,
         /// The timing that it was heard with.
         timing: BitTiming,
-        /// Good frames in a row.
+        /// Good frames heard at the end.
         frames: u32,
-        /// Bit rate by the stamps of frames that followed one another at once, in bit/s; a lower bound.
-        measured_bps: Option<f64>,
     },
     /// Nothing happened on the bus.
     NoTraffic,
@@ -432,7 +430,7 @@ impl Search<'_> {
 
     fn found(&self, bitrate_bps: u32, heard: Heard) -> Option<Outcome> {
         let timing = self.device.timing(bitrate_bps).ok()?;
-        Some(Outcome::Found { bitrate_bps, timing, frames: heard.frames, measured_bps: heard.fastest_bps })
+        Some(Outcome::Found { bitrate_bps, timing, frames: heard.frames })
     }
 }
 

@@ -50,14 +50,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let seconds = started.elapsed().as_secs_f64();
     match outcome {
-        Outcome::Found { bitrate_bps, timing, frames, measured_bps } => {
+        Outcome::Found { bitrate_bps, timing, frames } => {
             let mut out = std::io::stdout().lock();
             if args.json {
                 let object = serde_json::json!({
                     "channel": args.channel.number(),
                     "bitrate_bps": bitrate_bps,
                     "frames": frames,
-                    "measured_bps": measured_bps,
                     "sample_point_percent": f64::from(timing.sample_point_permille()) / 10.0,
                     "segments": [u16::from(timing.segment1), u16::from(timing.segment2)],
                     "prescaler": timing.prescaler,
@@ -66,7 +65,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 });
                 writeln!(out, "{object}")?;
             } else {
-                writeln!(out, "{bitrate_bps} bit/s, {frames} frames without an error, after {seconds:.2} s")?;
+                writeln!(out, "{bitrate_bps} bit/s, {frames} good frames, after {seconds:.2} s")?;
             }
             Ok(ExitCode::SUCCESS)
         }

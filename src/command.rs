@@ -125,7 +125,7 @@ impl Commands {
             Command::Status => Reply::Status(self.status(board)),
             Command::Time => Reply::Time(board.with_capture(|capture, _, clock| capture.now(clock))),
             Command::SetFilters { channel, filters } => self.set_filters(channel, &filters, board)?,
-            Command::Send { channel, frames } => send(channel, &frames, board)?,
+            Command::Send { channel, frames } => Reply::Queued { free: send(channel, &frames, board)? },
             Command::Abort { channel } => {
                 board.with_capture(|capture, traffic, clock| {
                     capture.abort(channel, &mut traffic[channel.index()], clock);
@@ -452,12 +452,12 @@ fn can_send<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>)
     if config.mode.transmits() { Ok(()) } else { Err(Refusal::ListenOnly) }
 }
 
-/// Queues frames, all or none.
+/// Queues frames, all or none, and returns how many places are free after it.
 pub fn send<'q, const N: usize>(
     channel: Channel,
     frames: &Vec<TxFrame, MAX_SEND>,
     board: &mut impl Board<'q, N>,
-) -> Result<Reply, Refusal> {
+) -> Result<u16, Refusal> {
     can_send(channel, board)?;
     if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
         return Err(Refusal::BadTag);
@@ -477,7 +477,7 @@ pub fn send<'q, const N: usize>(
         capture.kick(channel, &mut traffic[channel.index()], clock);
         capture.transmitter(channel).free()
     });
-    Ok(Reply::Queued { free: free as u16 })
+    Ok(free as u16)
 }
 
 fn set_periodic<'q, const N: usize>(

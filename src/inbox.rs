@@ -6,7 +6,10 @@ const INBOX: usize = 2048;
 /// Received bytes in order.
 pub struct Inbox {
     bytes: [u8; INBOX],
-    len: usize,
+    /// The first byte that is still wanted: the rest moves up only when room is short.
+    start: usize,
+    /// Behind the last byte.
+    end: usize,
     /// In the middle of something too long: all up to the next end is thrown away.
     skipping: bool,
 }
@@ -14,33 +17,41 @@ pub struct Inbox {
 impl Inbox {
     /// Empty.
     pub const fn new() -> Self {
-        Self { bytes: [0; INBOX], len: 0, skipping: false }
+        Self { bytes: [0; INBOX], start: 0, end: 0, skipping: false }
     }
 
     /// Forgets everything.
     pub const fn clear(&mut self) {
-        self.len = 0;
+        self.start = 0;
+        self.end = 0;
         self.skipping = false;
+    }
+
+    fn unread(&self) -> &[u8] {
+        &self.bytes[self.start..self.end]
     }
 
     /// Appends a packet, all or none; returns whether there was room.
     pub fn push(&mut self, packet: &[u8]) -> bool {
-        let Some(room) = self.bytes.get_mut(self.len..self.len + packet.len()) else { return false };
+        if packet.len() > INBOX - self.end {
+            self.bytes.copy_within(self.start..self.end, 0);
+            self.end -= self.start;
+            self.start = 0;
+        }
+        let Some(room) = self.bytes.get_mut(self.end..self.end + packet.len()) else { return false };
         room.copy_from_slice(packet);
-        self.len += packet.len();
+        self.end += packet.len();
         true
     }
 
     /// The first byte.
     pub fn first(&self) -> Option<u8> {
-        self.bytes[..self.len].first().copied()
+        self.unread().first().copied()
     }
 
     /// Drops the first bytes.
     pub fn skip(&mut self, count: usize) {
-        let count = count.min(self.len);
-        self.bytes.copy_within(count..self.len, 0);
-        self.len -= count;
+        self.start = self.end.min(self.start + count);
     }
 
     /// The end of something too long has come: what follows is good again. Returns whether something was being thrown away.
@@ -51,8 +62,8 @@ impl Inbox {
     /// Throws away an unfinished line: what stands before a zero that comes earlier than the next `end`. Returns whether there
     /// was one.
     pub fn drop_unfinished(&mut self, end: u8) -> bool {
-        match self.bytes[..self.len].iter().position(|&byte| byte == 0 || byte == end) {
-            Some(at) if self.bytes[at] == 0 => {
+        match self.unread().iter().position(|&byte| byte == 0 || byte == end) {
+            Some(at) if self.unread()[at] == 0 => {
                 self.skipping = false;
                 self.skip(at);
                 true
@@ -64,16 +75,16 @@ impl Inbox {
     /// Shows `read` what stands before the first `end`, which is then dropped with it. `None` if there is
     /// no `end` yet; `Some(None)` if something longer than `max` was thrown away.
     pub fn take_until<R>(&mut self, end: u8, max: usize, read: impl FnOnce(&[u8]) -> R) -> Option<Option<R>> {
-        let Some(at) = self.bytes[..self.len].iter().position(|&byte| byte == end) else {
-            if self.len > max {
+        let Some(at) = self.unread().iter().position(|&byte| byte == end) else {
+            if self.unread().len() > max {
                 self.skipping = true;
-                self.len = 0;
+                self.start = self.end;
             }
             return None;
         };
         let good = !self.skipping && at <= max;
         self.skipping = false;
-        let result = good.then(|| read(&self.bytes[..at]));
+        let result = good.then(|| read(&self.unread()[..at]));
         self.skip(at + 1);
         Some(result)
     }
@@ -82,5 +93,45 @@ impl Inbox {
 impl Default for Inbox {
     fn default() -> Self {
         Self::new()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Pushes messages of growing length and takes them a few later, so that what is unread wraps past the end many times.
+    #[test]
+    fn messages_come_out_as_they_went_in_wherever_they_lie() {
+        let mut inbox = Inbox::new();
+        let message = |n: usize| vec![n as u8 | 1; n * 7 % 600];
+        let take = |inbox: &mut Inbox, n| {
+            assert_eq!(inbox.take_until(0, 600, <[u8]>::to_vec), Some(Some(message(n))), "message {n}");
+        };
+        for n in 0..1000 {
+            let sent = [&message(n)[..], &[0]].concat();
+            assert!(sent.chunks(64).all(|packet| inbox.push(packet)), "message {n}");
+            if n >= 2 {
+                take(&mut inbox, n - 2);
+            }
+        }
+        take(&mut inbox, 998);
+        take(&mut inbox, 999);
+        assert_eq!(inbox.first(), None);
+    }
+
+    #[test]
+    fn all_of_the_room_is_used_and_what_does_not_fit_is_left_out_whole() {
+        let mut inbox = Inbox::new();
+        assert!(inbox.push(&[7; INBOX - 1]));
+        assert!(!inbox.push(&[8; 2]));
+        inbox.skip(1);
+        assert!(inbox.push(&[8; 2]));
+        assert!(!inbox.push(&[9]));
+        assert!(inbox.push(&[]));
+        inbox.skip(INBOX - 2);
+        assert_eq!(inbox.unread(), [8; 2]);
+        inbox.skip(INBOX);
+        assert_eq!(inbox.first(), None);
     }
 }

@@ -15,6 +15,7 @@ pub mod filters;
 pub mod inbox;
 pub mod lights;
 pub mod outbox;
+pub mod pending;
 pub mod ports;
 pub mod queue;
 pub mod recorder;

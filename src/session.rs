@@ -3,14 +3,15 @@
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
 //! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
 
-use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
-use cantap_wire::message::{DeviceMessage, why_unreadable};
-use cantap_wire::{Command, Refusal, Reply, Request, Response};
+use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal};
+use cantap_wire::message::{read_send, why_unreadable};
+use cantap_wire::{Command, Refusal, Reply, Request};
 
 use crate::QUEUE_BYTES;
-use crate::command::{Commands, Identity, Step, Work};
+use crate::command::{Commands, Identity, Step, Work, send};
 use crate::inbox::Inbox;
 use crate::outbox::Outbox;
+use crate::pending::Pending;
 use crate::ports::{Board, PACKET, Port};
 use crate::queue::Consumer;
 use crate::sender::Sender;
@@ -18,8 +19,6 @@ use crate::slcan::{Answer, Slcan};
 
 /// Longest request on the wire, zero byte included.
 const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);
-/// Largest response before CRC and COBS: saved settings with as many filters as there can be, 12 bytes each.
-const MAX_RESPONSE: usize = MAX_REQUEST;
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Language {
@@ -53,7 +52,7 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     outbox: Outbox,
     language: Language,
     work: Option<(Work, Origin)>,
-    response: Option<Response>,
+    pending: Pending,
 }
 
 impl<'q, const N: usize> Session<'q, N> {
@@ -68,7 +67,7 @@ impl<'q, const N: usize> Session<'q, N> {
             outbox: Outbox::new(),
             language: Language::Unknown,
             work: None,
-            response: None,
+            pending: Pending::new(),
         }
     }
 
@@ -104,7 +103,7 @@ impl<'q, const N: usize> Session<'q, N> {
             self.language = Language::Unknown;
             self.inbox.clear();
             self.outbox.clear();
-            self.response = None;
+            self.pending.clear();
             self.begin(Work::Silence, Origin::Device, board);
         }
         self.look_after_work(board);
@@ -143,7 +142,7 @@ impl<'q, const N: usize> Session<'q, N> {
                     self.language = Language::Native { greeted: true };
                     self.outbox.clear();
                 }
-                self.response = Some(Response { id, result });
+                self.pending.set(id, &result);
             }
             Origin::Line => self.slcan.answer(if result.is_ok() { Answer::Ok } else { Answer::Refused }),
             Origin::Device => {}
@@ -152,7 +151,7 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// Handles one request or line, unless something is still under way or unanswered. Returns whether there was one.
     fn handle_next(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        if self.work.is_some() || self.response.is_some() || self.slcan.is_answering() {
+        if self.work.is_some() || !self.pending.is_empty() || self.slcan.is_answering() {
             return false;
         }
         if self.language == Language::Unknown || self.inbox.first() == Some(0) {
@@ -191,49 +190,63 @@ impl<'q, const N: usize> Session<'q, N> {
     }
 
     fn handle_request(&mut self, greeted: bool, board: &mut impl Board<'q, N>) -> bool {
-        let mut message = [0; MAX_REQUEST_ENCODED];
+        // Most packets end no request: the room is not cleared for them.
+        let mut room = None;
         let taken = self.inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| {
-            unseal(encoded, &mut message).map(|message| {
-                (
-                    postcard::take_from_bytes::<u16>(message).map(|(id, _)| id),
-                    postcard::from_bytes::<Request>(message).map_err(|_| why_unreadable(message)),
-                )
-            })
+            unseal(encoded, room.insert([0; MAX_REQUEST_ENCODED])).ok()
         });
         let Some(message) = taken else { return false };
-        let (id, result) = match message {
-            Some(Ok((_, Ok(Request { id, command })))) => {
-                if !greeted && !matches!(command, Command::Hello { .. }) {
-                    (id, Err(Refusal::NoSession))
-                } else {
-                    (id, self.commands.execute(command, board))
-                }
-            }
-            // It was sent as it is, and is something that this device does not know.
-            Some(Ok((Ok(id), Err(refusal)))) => {
-                self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
-                (id, Err(refusal))
-            }
+        let Some(message) = message.flatten() else {
             // Damaged: there is no telling whom to answer.
-            _ => {
+            self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
+            return true;
+        };
+        if !(greeted && self.execute_send(message, board)) {
+            self.execute(message, greeted, board);
+        }
+        true
+    }
+
+    /// Queues the frames of a request to send; returns whether it was one.
+    ///
+    /// Not inlined, nor is what does the other requests: neither is to take the stack that only the other needs.
+    #[inline(never)]
+    fn execute_send(&mut self, message: &[u8], board: &mut impl Board<'q, N>) -> bool {
+        let mut frames = heapless::Vec::new();
+        let Some((id, channel)) = read_send(message, &mut frames) else { return false };
+        let queued = send(channel, &frames, board);
+        self.pending.set(id, &queued.map(|free| Reply::Queued { free }));
+        true
+    }
+
+    /// Does what a request asks for.
+    #[inline(never)]
+    fn execute(&mut self, message: &[u8], greeted: bool, board: &mut impl Board<'q, N>) {
+        let (id, result) = match postcard::from_bytes(message) {
+            Ok(Request { id, command }) if greeted || matches!(command, Command::Hello { .. }) => {
+                (id, self.commands.execute(command, board))
+            }
+            Ok(Request { id, .. }) => (id, Err(Refusal::NoSession)),
+            Err(_) => {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
-                return true;
+                let Ok((id, _)) = postcard::take_from_bytes(message) else { return };
+                // It was sent as it is, and is something that this device does not know.
+                (id, Err(why_unreadable(message)))
             }
         };
         match result {
-            Ok(Step::Done(reply)) => self.response = Some(Response { id, result: Ok(reply) }),
+            Ok(Step::Done(reply)) => self.pending.set(id, &Ok(reply)),
             Ok(Step::Begun(work)) => {
                 if matches!(work, Work::Restart | Work::Bootloader) {
                     // It ends in a restart: the answer goes first.
-                    self.response = Some(Response { id, result: Ok(Reply::Done) });
+                    self.pending.set(id, &Ok(Reply::Done));
                     self.work = Some((work, Origin::Device));
                 } else {
                     self.work = Some((work, Origin::Request(id)));
                 }
             }
-            Err(refusal) => self.response = Some(Response { id, result: Err(refusal) }),
+            Err(refusal) => self.pending.set(id, &Err(refusal)),
         }
-        true
     }
 
     fn handle_line(&mut self, board: &mut impl Board<'q, N>) -> bool {
@@ -259,25 +272,18 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// Fills the empty outbox with what goes next: an answer, then what was captured. Returns whether there was something.
     fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        let Self { queue, sender, slcan, outbox, response, .. } = self;
+        let Self { queue, sender, slcan, outbox, pending, .. } = self;
         match self.language {
             Language::Unknown => {}
-            Language::Native { .. } => match response.take() {
-                Some(response) => outbox.fill(|out| encode_response(response, out)),
-                None => outbox.fill(|out| sender.next_batch(queue, board.now(), out)),
-            },
+            Language::Native { .. } => {
+                if pending.is_empty() {
+                    outbox.fill(|out| sender.next_batch(queue, board.now(), out));
+                } else {
+                    outbox.fill(|out| pending.take(out));
+                }
+            }
             Language::Slcan => outbox.fill(|out| slcan.next_lines(queue, out)),
         }
         !self.outbox.is_empty()
     }
-}
-
-/// Writes a response, encoded, to `out` and returns its length. A zero goes first: a packet of the last
-/// session may still have been in the endpoint when this one began, and the zero ends what it left unfinished.
-fn encode_response(response: Response, out: &mut [u8]) -> usize {
-    let Some((end, out)) = out.split_first_mut() else { return 0 };
-    *end = 0;
-    let mut message = [0; MAX_RESPONSE + CRC_LEN];
-    // Cannot fail: every response is shorter (tested).
-    1 + framing::encode(&DeviceMessage::Response(response), &mut message, out).unwrap_or(0)
 }

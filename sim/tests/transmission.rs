@@ -29,12 +29,12 @@ fn saturate(rig: &mut Rig, channel: Channel, ms: u64) {
     rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + ms * MS));
 }
 
-/// Spacing within 2 us of the plan's, and each confirmation's stamp at most 3.5 us after the frame's end.
-fn hold_times(what: &str, replayed: Option<&[Replayed]>) {
+/// Spacing within so much of the plan's, and each confirmation's stamp at most 3.5 us after the frame's end.
+fn hold_times(what: &str, replayed: Option<&[Replayed]>, within_us: f64) {
     let replayed = replayed.unwrap_or_else(|| panic!("{what}: not all frames in order"));
     for one in replayed {
         eprintln!("{what}: spacing {:.2} us, stamps {:?}", one.late.width_us(), one.stamps);
-        assert!(one.late.width_us() <= 2.0, "{what}: {one:?}");
+        assert!(one.late.width_us() <= within_us, "{what}: {one:?}");
         assert!(one.stamps.min_us >= -0.1 && one.stamps.max_us <= 3.5, "{what}: {one:?}");
     }
 }
@@ -44,7 +44,7 @@ fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
     for (load, seconds) in [(10.0, 0.3), (30.0, 0.15), (60.0, 0.15), (90.0, 0.2), (98.0, 0.2)] {
         let Some(mut rig) = joined(&[Can1]) else { return };
         let replayed = replay(&mut rig, &[Can1], load, seconds).unwrap();
-        hold_times(&format!("alone at {load} %"), replayed.as_deref());
+        hold_times(&format!("alone at {load} %"), replayed.as_deref(), 0.5);
     }
 }
 
@@ -52,11 +52,11 @@ fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
 /// a frame.
 #[test]
 fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
-    for load in [30.0, 60.0, 90.0] {
+    for load in [30.0, 60.0, 90.0, 98.0] {
         let Some(mut rig) = joined(&[Can1]) else { return };
         saturate(&mut rig, Can2, 280);
         let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
-        hold_times(&format!("beside 100 % at {load} %"), replayed.as_deref());
+        hold_times(&format!("beside 100 % at {load} %"), replayed.as_deref(), 1.0);
         rig.run_for(100 * MS).unwrap();
         rig.close(Can2).unwrap();
         assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
@@ -71,10 +71,10 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
 
 #[test]
 fn two_replays_at_once_keep_their_spacing() {
-    for load in [10.0, 30.0, 45.0] {
+    for load in [10.0, 30.0, 45.0, 60.0] {
         let Some(mut rig) = joined(&[Can1, Can2]) else { return };
         let replayed = replay(&mut rig, &[Can1, Can2], load, 0.15).unwrap();
-        hold_times(&format!("both at {load} %"), replayed.as_deref());
+        hold_times(&format!("both at {load} %"), replayed.as_deref(), 2.5);
     }
 }
 
@@ -88,13 +88,12 @@ fn a_stream_of_eight_byte_frames_fills_the_bus() {
     assert!(filled[0].stamps.min_us >= -0.1 && filled[0].stamps.max_us <= 3.5, "{filled:?}");
 }
 
-/// Faster than the device takes them: the host waits, and nothing is dropped.
 #[test]
-fn two_streams_at_once_lose_and_reorder_nothing() {
+fn two_streams_at_once_fill_both_buses() {
     let Some(mut rig) = joined(&[Can1, Can2]) else { return };
     let filled = fill(&mut rig, &[Can1, Can2], Kind::Std8, 0.2).unwrap().expect("all frames in order");
     eprintln!("{filled:?}");
-    assert!(filled.iter().all(|one| one.load_percent >= 75.0), "{filled:?}");
+    assert!(filled.iter().all(|one| one.load_percent >= 99.0), "{filled:?}");
 }
 
 /// A full record queue has no room for confirmations. What is due then waits for room; an alarm that came again and again would

@@ -150,11 +150,41 @@ pub enum Command {
     },
 }
 
+/// The index of [`Command::Send`], as the pinned bytes have it.
+const SEND: u32 = 6;
+
+/// Reads a request that is a [`Command::Send`] into `frames`, which is empty, and returns its id and channel. `None` if it is
+/// another or cannot be read; what is in `frames` then means nothing.
+///
+/// It is what a streaming host sends thousands of times a second: as a [`Request`] it would be moved about with room for the
+/// longest command.
+pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<(u16, Channel)> {
+    type Head = (u16, u32, Channel, usize);
+    let (id, command) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?.0;
+    if command != SEND {
+        return None;
+    }
+    let ((_, _, channel, count), mut rest) = postcard::take_from_bytes::<Head>(request).ok()?;
+    for _ in 0..count {
+        let (frame, behind) = postcard::take_from_bytes(rest).ok()?;
+        frames.push(frame).ok()?;
+        rest = behind;
+    }
+    Some((id, channel))
+}
+
+/// Writes a [`DeviceMessage::Response`] to `out` and returns its length, `None` if there is no room. The answer stays where
+/// it is: a [`Response`] that is moved about has room for the longest.
+pub fn write_response(id: u16, result: &Result<Reply, Refusal>, out: &mut [u8]) -> Option<usize> {
+    /// The variant's index, as the pinned bytes have it.
+    const RESPONSE: u32 = 1;
+    postcard::to_slice(&(RESPONSE, id, result), out).ok().map(|written| written.len())
+}
+
 /// Why a request, sealed as it was sent, cannot be read: [`Refusal::BadId`] or [`Refusal::BadDlc`] where it carries a frame
 /// that cannot be, else [`Refusal::Malformed`].
 pub fn why_unreadable(request: &[u8]) -> Refusal {
-    // The indices of commands that carry frames, as the pinned bytes have them.
-    const SEND: u32 = 6;
+    // The indices of the other commands that carry frames, as the pinned bytes have them.
     const SET_PERIODIC: u32 = 8;
     const SET_TRIGGER: u32 = 9;
     type Head = (u16, u32, Channel);

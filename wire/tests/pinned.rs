@@ -5,8 +5,9 @@ use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
 use cantap_wire::framing::MAX_REQUEST;
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, DeviceMessage, Filter, FrameKind, MAX_FILTERS, Mode,
-    Modifier, Periodic, RegisterSet, Registers, Status, Trigger, TxFrame, capability, why_unreadable,
+    ChannelConfig, ChannelStatus, Checksum, Defaults, DeviceMessage, Filter, FrameKind, MAX_FILTERS,
+    MAX_SEND, Mode, Modifier, Periodic, RegisterSet, Registers, Status, Trigger, TxFrame, capability,
+    read_send, why_unreadable, write_response,
 };
 use cantap_wire::record::{
     BusErrorKind, ErrorState, LossStage, MAX_RECORD, TransmitFailure, encode_event, encode_received,
@@ -24,6 +25,12 @@ fn hex(bytes: &[u8]) -> String {
 fn bytes(value: &impl Serialize) -> String {
     let mut out = [0; 600];
     hex(postcard::to_slice(value, &mut out).unwrap())
+}
+
+fn written(result: &Result<Reply, Refusal>) -> String {
+    let mut out = [0; 600];
+    let len = write_response(5, result, &mut out).unwrap();
+    hex(&out[..len])
 }
 
 fn frame(text: &str) -> Frame {
@@ -247,8 +254,9 @@ fn replies() {
             "08 ac 02 0d 02 01 00 00 01 01 00 01 01 01 ac 02 01",
         ),
     ] {
-        let message = DeviceMessage::Response(Response { id: 5, result: Ok(reply) });
+        let message = DeviceMessage::Response(Response { id: 5, result: Ok(reply.clone()) });
         assert_eq!(bytes(&message), format!("01 05 00 {expected}"), "{message:?}");
+        assert_eq!(written(&Ok(reply)), format!("01 05 00 {expected}"), "{message:?}");
     }
 }
 
@@ -278,6 +286,7 @@ fn refusals() {
     ] {
         let message = DeviceMessage::Response(Response { id: 5, result: Err(refusal) });
         assert_eq!(bytes(&message), format!("01 05 01 {expected}"), "{message:?}");
+        assert_eq!(written(&Err(refusal)), format!("01 05 01 {expected}"), "{message:?}");
     }
 }
 
@@ -285,6 +294,35 @@ fn refusals() {
 fn batch_headers() {
     let header = BatchHeader { sequence: 300, base_ticks: 1 << 32, frames_before: [128, 1] };
     assert_eq!(bytes(&DeviceMessage::Batch(header)), "00 ac 02 80 80 80 80 10 80 01 01");
+}
+
+/// What a device reads apart must be what the whole type reads.
+#[test]
+fn frames_to_be_sent_are_read_as_the_request_has_them_and_no_other_request_is() {
+    let tx = |tag: u32| TxFrame {
+        tag,
+        frame: frame(if tag.is_multiple_of(2) { "1F334455#R8_F" } else { "123#DEADBEEF" }),
+        at_ticks: tag.is_multiple_of(3).then_some(u64::MAX - u64::from(tag)),
+    };
+    let read = |request: &[u8]| {
+        let mut frames = heapless::Vec::new();
+        read_send(request, &mut frames).map(|(id, channel)| (id, channel, frames))
+    };
+    let encoded = |id, command| {
+        let mut out = [0; MAX_REQUEST];
+        postcard::to_slice(&Request { id, command }, &mut out).unwrap().to_vec()
+    };
+    for count in 0..=MAX_SEND as u32 {
+        let frames: heapless::Vec<_, MAX_SEND> = (0..count).map(|n| tx(n * 1000)).collect();
+        let request = encoded(300, Command::Send { channel: Can2, frames: frames.clone() });
+        assert_eq!(read(&request), Some((300, Can2, frames)));
+        for cut in 0..request.len() {
+            assert_eq!(read(&request[..cut]), None, "{cut} bytes of {count} frames");
+        }
+    }
+    let nine = [&[5, 6, 0, 9][..], &[1, 1, 0, 0, 0].repeat(9)].concat();
+    assert_eq!(read(&nine), None);
+    assert_eq!(read(&encoded(5, Command::Close { channel: Can1 })), None);
 }
 
 /// Requests of a client that does not keep to the ranges, byte by byte.

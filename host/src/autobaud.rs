@@ -3,7 +3,7 @@
 //! A rate is right when several frames in a row arrive without an error. Near rates pass that test too, since controllers
 //! resynchronise: 253.97 kbit/s may be heard at 250. So a common rate must be heard again with the sample point as late
 //! as it can be, where 1.5 % are too much; and for any other the rates around are listened to, until the frames themselves tell
-//! how fast the bus is ([`hearing`]).
+//! how fast the bus is (`hearing.rs`).
 
 mod hearing;
 #[cfg(all(test, feature = "virtual"))]

@@ -162,6 +162,18 @@ impl Machine {
         self.trace.take()
     }
 
+    /// The exceptions that ran since the probe was reset, `span` cycles ago: name, how often, and their share of the time in per cent,
+    /// without what interrupted them.
+    pub fn tasks(&self, span: u64) -> Vec<(String, u64, f64)> {
+        (0..crate::probe::EXCEPTIONS as u16)
+            .filter(|number| self.probe().entries(*number) > 0)
+            .map(|number| {
+                let share = 100.0 * self.probe().cycles(number) as f64 / span.max(1) as f64;
+                (self.exception_name(number), self.probe().entries(number), share)
+            })
+            .collect()
+    }
+
     /// An exception's name: its handler's, where the vector table and the symbols tell it.
     pub fn exception_name(&self, number: u16) -> String {
         let handler = self.cpu.word(map::FLASH.start + 4 * u32::from(number)).unwrap_or(0) & !1;

@@ -255,18 +255,11 @@ impl Costs {
     fn of(machine: &Machine, span: u64) -> Self {
         let probe = machine.probe();
         let receive_lines = CAN_IRQS.iter().flat_map(|irqs| &irqs[1..3]);
-        let tasks = (0..crate::probe::EXCEPTIONS as u16)
-            .filter(|number| probe.entries(*number) > 0)
-            .map(|number| {
-                let share = 100.0 * probe.cycles(number) as f64 / span as f64;
-                (machine.exception_name(number), probe.entries(number), share)
-            })
-            .collect();
         Self {
             masked_ns: probe.longest_masked().cycles as f64 * 1000.0 / CYCLES_PER_US as f64,
             load_pct: probe.load_percent(machine.now()),
             capture_cycles: receive_lines.map(|irq| probe.cycles(FIRST_INTERRUPT + irq)).sum(),
-            tasks,
+            tasks: machine.tasks(span),
         }
     }
 }

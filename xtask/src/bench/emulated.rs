@@ -34,6 +34,7 @@ pub fn run() -> Result<()> {
         "{:<10} {:>8} {:>7} {:>10} {:>9} {:>20} {:>8} {:>10}",
         "", "", "", "frame", "ns, most", "min / median / max", "/frame", "emulated s"
     );
+    let mut shares = Vec::new();
     for (name, kind, channels) in [
         ("std0 ×1", Kind::Std0, &Channel::ALL[..1]),
         ("std0 ×2", Kind::Std0, &Channel::ALL[..]),
@@ -41,7 +42,13 @@ pub fn run() -> Result<()> {
         ("ext8 ×2", Kind::Ext8, &Channel::ALL[..]),
         ("mix ×2", Kind::Mix, &Channel::ALL[..]),
     ] {
-        load(name, kind, channels)?;
+        shares.push((name, load(name, kind, channels)?));
+    }
+    println!("processor by interrupt, %:");
+    for (name, tasks) in shares.iter().take(2) {
+        for (task, entries, share) in tasks {
+            println!("  {name:<10} {task:<24} {share:>6.2}  ({entries} times)");
+        }
     }
     stall()
 }
@@ -65,7 +72,8 @@ fn loaded(kind: Kind, channels: &[Channel], ms: u64) -> Result<Rig> {
     Ok(rig)
 }
 
-fn load(name: &str, kind: Kind, channels: &[Channel]) -> Result<()> {
+/// Measures one load and prints it. Returns what ran, with its share of the time in per cent.
+fn load(name: &str, kind: Kind, channels: &[Channel]) -> Result<Vec<(String, u64, f64)>> {
     let mut rig = loaded(kind, channels, LOAD_MS)?;
     let sent_before = usb_bytes(&mut rig);
     let begin = Instant::now();
@@ -74,6 +82,7 @@ fn load(name: &str, kind: Kind, channels: &[Channel]) -> Result<()> {
     let probe = rig.machine.probe();
     let cpu = probe.load_percent(rig.now());
     let masked_ns = probe.longest_masked().cycles * 1000 / CYCLES_PER_US;
+    let tasks = rig.machine.tasks(rig.now() - probe.since());
     let capture: u64 = channels
         .iter()
         .flat_map(|channel| &CAN_IRQS[channel.index()][1..3])
@@ -95,7 +104,7 @@ fn load(name: &str, kind: Kind, channels: &[Channel]) -> Result<()> {
         bytes as f64 / frames as f64,
         host_s * 1000.0 / LOAD_MS as f64,
     );
-    Ok(())
+    Ok(tasks)
 }
 
 /// The host stops reading in the middle of the worst traffic on one channel, and reads again.

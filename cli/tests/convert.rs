@@ -96,6 +96,25 @@ fn filters_channels_and_times_pick_records() {
 }
 
 #[test]
+fn details_of_error_frames_that_are_not_kept_are_counted() {
+    let directory = directory("details");
+    let log = "(1.000000) can0 20000088#0000040B00000000\n(2.000000) can0 123#11\n(3.000000) can0 20000088#0000040000000000\n\
+               (4.000000) can0 20000002#0900000000000000\n(5.000000) can0 123#22\n";
+    std::fs::write(directory.join("details.log"), log).unwrap();
+    for name in ["again.log", "again.csv", "again.pcapng"] {
+        let (code, _, err) = cantap(&directory, &["convert", "details.log", name]);
+        assert_eq!(code, Some(0));
+        assert!(
+            err.contains("error frames say more than their kind") && err.contains("(2)"),
+            "{name}: {err}"
+        );
+        // What was written is told whole.
+        let (_, _, err) = cantap(&directory, &["convert", name, "twice.log"]);
+        assert!(!err.contains("error frames say more"), "{name}: {err}");
+    }
+}
+
+#[test]
 fn a_broken_line_is_told_and_left_out_and_strict_stops_there() {
     let directory = directory("broken");
     fs::write(directory.join("broken.log"), lines(&[0, 1]) + "nonsense\n" + &lines(&[2, 3, 4])).unwrap();

@@ -175,6 +175,32 @@ impl ErrorFrame {
         (bus_error, None)
     }
 
+    /// Whether [`Self::events`] tell all that the frame says.
+    pub fn is_told_whole(&self) -> bool {
+        let (event, second) = self.events();
+        let mut again = Self { classes: 0, data: [0; 8] };
+        for frame in [Some(event), second].into_iter().flatten().filter_map(|event| Self::of(&event)) {
+            again.classes |= frame.classes;
+            again.data.iter_mut().zip(frame.data).for_each(|(byte, other)| *byte |= other);
+        }
+        let mut bare = again;
+        // Without the bytes that only this program writes.
+        match event {
+            TraceEvent::Lost { .. } => bare.data = [0, RX_OVERFLOW, 0, 0, 0, 0, 0, 0],
+            TraceEvent::TransmitFailed { .. } => bare.data = [0; 8],
+            // Which of the counters, and how the change came about, the state itself need not say.
+            TraceEvent::State { .. } => {
+                const CHANGES: u32 = CONTROLLER | BUS_OFF | RESTARTED;
+                bare.classes = bare.classes & !CHANGES | self.classes & CHANGES;
+                bare.data[1] = self.data[1] & (WARNING | PASSIVE | ACTIVE);
+            }
+            _ => {}
+        }
+        let same =
+            |other: &Self| other.classes | BUS_ERROR == self.classes | BUS_ERROR && other.data == self.data;
+        same(&again) || same(&bare)
+    }
+
     /// The kind of bus error, if the frame names one.
     fn kind(&self) -> Option<BusErrorKind> {
         if self.classes & NO_ACK != 0 {
@@ -207,6 +233,7 @@ mod tests {
         fn every_event_round_trips(event in event()) {
             let frame = ErrorFrame::of(&event).unwrap();
             prop_assert_eq!(frame.events(), (event, None));
+            prop_assert!(frame.is_told_whole());
             // With the class that makes python-can see an error frame.
             let marked = ErrorFrame { classes: frame.classes | BUS_ERROR, ..frame };
             prop_assert_eq!(marked.events(), (event, None));
@@ -237,5 +264,11 @@ mod tests {
         assert_eq!(events(0x020, [0; 8]), (no_ack, None));
         let restarted = TraceEvent::State { state: ErrorState::Active, counters: None };
         assert_eq!(events(0x100, [0; 8]), (restarted, None));
+        let whole = |classes, data| ErrorFrame { classes, data }.is_told_whole();
+        assert!(whole(0x204, [0, 0x10, 0, 0, 0, 0, 0, 128]) && whole(0x08C, [0, 8, 4, 0, 0, 0, 0, 0]));
+        assert!(whole(0x004, [0, 1, 0, 0, 0, 0, 0, 0]) && whole(0x001, [0; 8]) && whole(0x020, [0; 8]));
+        // Where in the frame it was, at which bit arbitration was lost, and a transceiver's fault are not kept.
+        assert!(!whole(0x088, [0, 0, 4, 0x0B, 0, 0, 0, 0]) && !whole(0x002, [9, 0, 0, 0, 0, 0, 0, 0]));
+        assert!(!whole(0x010, [0, 0, 0, 0, 4, 0, 0, 0]));
     }
 }

@@ -10,7 +10,7 @@ use super::input::Input;
 use super::interfaces::{self, Interfaces};
 use super::issue::Fault;
 use super::line::{Line, Seconds};
-use super::reader::{BATCH, Decode, Found};
+use super::reader::{BATCH, DETAILS_LEFT_OUT, Decode, Found};
 use super::text::{self, NS_PER_S};
 use super::writer::{Encode, LeftOut};
 use crate::socketcan::{BUS_ERROR, ERROR_FLAG, ErrorFrame};
@@ -25,6 +25,8 @@ pub(crate) struct Decoder {
     /// A second event of the last line.
     pending: Option<TraceRecord>,
     lengths: Lengths,
+    /// Error frames whose details are left out, to be told.
+    details: u64,
     /// The last line looked whole and had no line end.
     end_missing: bool,
     /// The last second's digits and time: most lines are in the same second as the one before.
@@ -36,6 +38,10 @@ impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(record) = self.pending.take() {
             return Ok(Found::Record(record));
+        }
+        if let Some(details) = self.details.checked_sub(1) {
+            self.details = details;
+            return Ok(Found::Note(DETAILS_LEFT_OUT));
         }
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
@@ -169,7 +175,9 @@ impl Decoder {
         let channel = self.interfaces.channel(interface);
         if id.len() == 8 && raw & ERROR_FLAG != 0 {
             let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
-            let (event, second) = ErrorFrame { classes: raw & (ERROR_FLAG - 1), data: bytes }.events();
+            let frame = ErrorFrame { classes: raw & (ERROR_FLAG - 1), data: bytes };
+            self.details += u64::from(!frame.is_told_whole());
+            let (event, second) = frame.events();
             return Ok((TraceRecord { time_ns, channel, event }, second));
         }
         let id = match id.len() {

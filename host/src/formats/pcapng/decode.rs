@@ -7,7 +7,7 @@ use cantap_wire::{Frame, Id};
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::interfaces::Interfaces;
 use super::super::issue::{Fault, Place};
-use super::super::reader::{Decode, Found};
+use super::super::reader::{DETAILS_LEFT_OUT, Decode, Found};
 use super::super::text::NS_PER_S;
 use super::{
     BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED,
@@ -31,6 +31,8 @@ pub(crate) struct Decoder {
     names: Interfaces,
     /// Records that the last packet told beside its first.
     pending: Option<TraceRecord>,
+    /// Error frames whose details are left out, to be told.
+    details: u64,
 }
 
 /// What an interface description says.
@@ -91,6 +93,10 @@ impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(record) = self.pending.take() {
             return Ok(Found::Record(record));
+        }
+        if let Some(details) = self.details.checked_sub(1) {
+            self.details = details;
+            return Ok(Found::Note(DETAILS_LEFT_OUT));
         }
         loop {
             let place = Place::Offset(input.offset());
@@ -290,7 +296,7 @@ impl Decoder {
             [_, _, _, _, len, kind, ..] if kind & FD_FORMAT != 0 || *len > 8 => {
                 Err(Fault::Unsupported("a CAN FD frame".into()))
             }
-            _ => event(packet, flags),
+            _ => event(packet, flags, &mut self.details),
         };
         match event {
             Ok((event, second)) => {
@@ -312,16 +318,18 @@ impl Decoder {
     }
 }
 
-/// What a classical packet says.
+/// What a classical packet says. `details` counts error frames that say more than is kept.
 #[inline]
-fn event(packet: &[u8], flags: u32) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
+fn event(packet: &[u8], flags: u32, details: &mut u64) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
     let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
     let (len, raw_dlc) = (packet[4], packet[7]);
     let mut data = [0; 8];
     let present = packet[8..].len().min(usize::from(len)).min(8);
     data[..present].copy_from_slice(&packet[8..8 + present]);
     if id & ERROR_FLAG != 0 {
-        return Ok(ErrorFrame { classes: id & (ERROR_FLAG - 1), data }.events());
+        let frame = ErrorFrame { classes: id & (ERROR_FLAG - 1), data };
+        *details += u64::from(!frame.is_told_whole());
+        return Ok(frame.events());
     }
     let remote = id & REMOTE != 0;
     if present < usize::from(len) && !remote {

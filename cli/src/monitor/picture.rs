@@ -42,7 +42,7 @@ pub fn svg(buffer: &Buffer) -> String {
     let mut out = format!(
         "<svg xmlns=\"http://www.w3.org/2000/svg\" viewBox=\"0 0 {width} {height}\" width=\"{width}\" \
          height=\"{height}\" font-family=\"'DejaVu Sans Mono','Cascadia Mono',Menlo,Consolas,monospace\" \
-         font-size=\"14\" xml:space=\"preserve\">\n\
+         font-size=\"14\">\n\
          <rect width=\"{width}\" height=\"{height}\" rx=\"6\" fill=\"{BACKGROUND}\"/>\n"
     );
     for row in 0..buffer.area.height {
@@ -99,7 +99,8 @@ fn run(out: &mut String, text: &str, look: &Look, span: (u16, u16), row: u16) {
         out,
         "<text x=\"{x:.1}\" y=\"{baseline:.1}\" textLength=\"{width:.1}\" fill=\"{}\"{style}>{}</text>",
         look.foreground,
-        visible.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;")
+        // Browsers fold ordinary spaces into one, whatever xml:space says.
+        visible.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace(' ', "\u{a0}")
     );
 }
 

@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use cantap::formats::{ReadOptions, open_reader};
+use cantap::formats::{Fault, ReadIssue, ReadOptions, open_reader};
 
 const BUS: [&str; 6] = ["capture", "-d", "virtual:load=60,frames=std8", "-b", "500k", "-o"];
 
@@ -28,6 +28,15 @@ fn files(folder: &Path) -> Vec<PathBuf> {
 fn records(path: &Path) -> usize {
     let reader = open_reader(path, &ReadOptions::default()).unwrap();
     reader.collect::<Result<Vec<_>, _>>().unwrap().len()
+}
+
+/// As [`records`], of a file that was being written to: the system may have been stopped between two of its pages. Then the
+/// cut is told, and nothing else is wrong.
+fn records_of_the_last(path: &Path) -> usize {
+    let items: Vec<_> = open_reader(path, &ReadOptions::default()).unwrap().collect();
+    let issues: Vec<_> = items.iter().filter_map(|item| item.as_ref().err()).collect();
+    assert!(matches!(issues[..], [] | [ReadIssue { fault: Fault::Truncated(_), .. }]), "{issues:?}");
+    items.len() - issues.len()
 }
 
 #[test]
@@ -66,9 +75,11 @@ fn a_capture_that_is_killed_leaves_files_that_are_each_whole() {
         for (at, path) in paths.iter().enumerate() {
             let size = path.metadata().unwrap().len();
             assert!(size <= 40_000, "{}: {size} bytes", path.display());
+            let is_last = at + 1 == paths.len();
             // The last one may have been created just before.
-            assert!(at + 1 == paths.len() || records(path) > 50, "{}", path.display());
-            assert!(size == 0 || records(path) > 0, "{}", path.display());
+            let records = if is_last { records_of_the_last(path) } else { records(path) };
+            assert!(is_last || records > 50, "{}", path.display());
+            assert!(size == 0 || records > 0, "{}", path.display());
         }
     }
 }

@@ -27,6 +27,9 @@ pub const COMMON_BPS: [u32; 14] = [
 
 /// Good frames in a row that make a candidate.
 const GOOD_FRAMES: u32 = 4;
+/// Good frames in a row that a common rate needs with the sharpest timing: at a neighbour some frames pass, and more in a row
+/// rarely.
+const SHARP_FRAMES: u32 = 8;
 /// Frames and errors that are weighed where there are both: a frame may have been destroyed at the right rate, too.
 const WEIGHED_FRAMES: u32 = 24;
 /// The right rate is wrong about fewer than one frame in so many.
@@ -244,7 +247,17 @@ impl Search<'_> {
 
     /// Listens with a timing whether it is the right one.
     fn find(&mut self, timing: BitTiming, dwell: Duration) -> Result<Heard, DeviceError> {
-        let heard = self.listen(timing, Purpose::Find, dwell)?;
+        self.find_by(timing, Purpose::Find, dwell)
+    }
+
+    /// As [`Self::find`], for a purpose of one's own.
+    fn find_by(
+        &mut self,
+        timing: BitTiming,
+        purpose: Purpose,
+        dwell: Duration,
+    ) -> Result<Heard, DeviceError> {
+        let heard = self.listen(timing, purpose, dwell)?;
         if heard.frames > 0 && heard.errors > 0 {
             self.listen(timing, Purpose::Weigh, dwell)
         } else {
@@ -346,7 +359,7 @@ impl Search<'_> {
         if COMMON_BPS.contains(&candidate_bps)
             && !too_slow
             && let Some(timing) = sharpest(clocks_of(clock_hz, rate))
-            && self.find(timing, dwell)?.is_good()
+            && self.find_by(timing, Purpose::Doubt { frames: SHARP_FRAMES }, dwell)?.is_good()
             && !self.is_slower_than(rate, dwell)?
         {
             return Ok(self.found(candidate_bps, heard));

@@ -29,7 +29,7 @@ pub const COMMON_BPS: [u32; 14] = [
 const GOOD_FRAMES: u32 = 4;
 /// Good frames in a row that a common rate needs with the sharpest timing: at a neighbour some frames pass, and more in a row
 /// rarely.
-const SHARP_FRAMES: u32 = 8;
+const SHARP_FRAMES: u32 = 10;
 /// Frames and errors that are weighed where there are both: a frame may have been destroyed at the right rate, too.
 const WEIGHED_FRAMES: u32 = 24;
 /// The right rate is wrong about fewer than one frame in so many.

@@ -134,6 +134,8 @@ impl Rotating {
     }
 
     fn next_file(&mut self) -> io::Result<()> {
+        // Whole before there is another, if only with a provisional end: the program may be killed at any moment.
+        self.current.flush()?;
         let (name, next) = create(&self.path, &mut self.number, &self.options)?;
         let full = std::mem::replace(&mut self.current, next);
         self.left_out.merge(&full.finish()?);

@@ -141,26 +141,40 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// Waits for what is due so soon that the alarm would come too late for it, on either channel, and sends it.
+    /// Waits for what is due so soon that the alarm would come too late for it, on either channel, and sends it. All but the
+    /// request itself is done ahead, so that two frames due at one moment leave at one moment.
     fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
         loop {
-            let mut now = self.recorder.time(clock.now());
-            let Some(due) = self.next_queued().filter(|due| *due <= now + u64::from(C::ALARM_EARLY_TICKS))
-            else {
+            let now = self.recorder.time(clock.now());
+            let early = u64::from(C::ALARM_EARLY_TICKS);
+            let Some(next) = self.next_due(Transmitter::next_queued).filter(|due| *due <= now + early) else {
                 return;
             };
-            if due > now {
-                clock.wait_until(due as u32);
-                now = self.recorder.time(clock.now());
-            }
-            let mut any = false;
-            for (state, traffic) in self.channels.iter_mut().zip(traffic.iter_mut()) {
+            // What is due soon after it would find no time for this between the two.
+            let until = next.max(now) + early / 2;
+            let mut ready = [const { None }; CHANNELS];
+            for ((state, traffic), ready) in self.channels.iter_mut().zip(traffic.iter_mut()).zip(&mut ready)
+            {
                 if state.open.is_some() {
-                    any |= state.transmitter.load_due(traffic, now);
+                    *ready = state.transmitter.prepare_due(traffic, now, until);
                 }
             }
-            if !any {
+            let due = |channel: usize| ready[channel].map_or(u64::MAX, |(_, at)| at);
+            let order = if due(0) <= due(1) { [0, 1] } else { [1, 0] };
+            if due(order[0]) == u64::MAX {
                 return;
+            }
+            for channel in order {
+                let Some((mailbox, at)) = ready[channel] else { continue };
+                if at > now {
+                    clock.wait_until(at as u32);
+                }
+                traffic[channel].request(mailbox);
+            }
+            for (state, ready) in self.channels.iter_mut().zip(ready) {
+                if let Some((mailbox, _)) = ready {
+                    state.transmitter.requested(mailbox);
+                }
             }
         }
     }
@@ -177,15 +191,15 @@ impl<'q, const N: usize> Capture<'q, N> {
     pub fn on_alarm<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
         self.load_in_time(traffic, clock);
         let mut now = self.recorder.time(clock.now());
-        if let Some(due) = self.next_due()
-            && due.saturating_sub(now) <= u64::from(C::ALARM_EARLY_TICKS)
+        if let Some(due) = self.next_due(Transmitter::next_periodic)
             && due > now
+            && due - now <= u64::from(C::ALARM_EARLY_TICKS)
         {
             clock.wait_until(due as u32);
             now = self.recorder.time(clock.now());
         }
         for (state, traffic) in self.channels.iter_mut().zip(traffic) {
-            if state.open.is_some() {
+            if state.open.is_some() && state.transmitter.has_more(now) {
                 state.transmitter.service(traffic, &mut self.recorder, now);
             }
         }
@@ -230,22 +244,16 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// When a frame of a queue is due next.
-    fn next_queued(&self) -> Option<u64> {
+    /// When something is due for transmission next, on either channel.
+    fn next_due(&self, of: fn(&Transmitter) -> Option<u64>) -> Option<u64> {
         let open = self.channels.iter().filter(|state| state.open.is_some());
-        open.filter_map(|state| state.transmitter.next_queued()).min()
-    }
-
-    /// When something is due for transmission next.
-    fn next_due(&self) -> Option<u64> {
-        let open = self.channels.iter().filter(|state| state.open.is_some());
-        open.filter_map(|state| state.transmitter.next_due()).min()
+        open.filter_map(|state| of(&state.transmitter)).min()
     }
 
     /// Sets the alarm for what is due next.
     pub fn arm<C: Clock>(&mut self, clock: &C) {
         let now = self.recorder.time(clock.now());
-        let alarm = self.next_due().map(|due| {
+        let alarm = self.next_due(Transmitter::next_due).map(|due| {
             let early = due.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
             // Not earlier than now: a time that has passed for long would look like one that is far ahead.
             early.clamp(now, now + ALARM_AHEAD_TICKS) as u32

@@ -1,7 +1,7 @@
 //! Bytes from the host, until a whole request or line is there.
 
-/// Room for bytes: several of the longest requests.
-const INBOX: usize = 2048;
+/// Room for bytes: six of the longest requests to send, and what a host may have under way by `docs/wire-protocol.md`.
+const INBOX: usize = 4096;
 
 /// Received bytes in order.
 pub struct Inbox {
@@ -10,6 +10,8 @@ pub struct Inbox {
     start: usize,
     /// Behind the last byte.
     end: usize,
+    /// What [`Self::take_until`] last looked for, and how many of the unread bytes are known not to be it.
+    searched: (u8, usize),
     /// In the middle of something too long: all up to the next end is thrown away.
     skipping: bool,
 }
@@ -17,13 +19,14 @@ pub struct Inbox {
 impl Inbox {
     /// Empty.
     pub const fn new() -> Self {
-        Self { bytes: [0; INBOX], start: 0, end: 0, skipping: false }
+        Self { bytes: [0; INBOX], start: 0, end: 0, searched: (0, 0), skipping: false }
     }
 
     /// Forgets everything.
     pub const fn clear(&mut self) {
         self.start = 0;
         self.end = 0;
+        self.searched.1 = 0;
         self.skipping = false;
     }
 
@@ -52,6 +55,7 @@ impl Inbox {
     /// Drops the first bytes.
     pub fn skip(&mut self, count: usize) {
         self.start = self.end.min(self.start + count);
+        self.searched.1 = 0;
     }
 
     /// The end of something too long has come: what follows is good again. Returns whether something was being thrown away.
@@ -75,13 +79,16 @@ impl Inbox {
     /// Shows `read` what stands before the first `end`, which is then dropped with it. `None` if there is
     /// no `end` yet; `Some(None)` if something longer than `max` was thrown away.
     pub fn take_until<R>(&mut self, end: u8, max: usize, read: impl FnOnce(&[u8]) -> R) -> Option<Option<R>> {
-        let Some(at) = self.unread().iter().position(|&byte| byte == end) else {
+        let searched = if self.searched.0 == end { self.searched.1 } else { 0 };
+        let Some(at) = self.unread()[searched..].iter().position(|&byte| byte == end) else {
+            self.searched = (end, self.unread().len());
             if self.unread().len() > max {
                 self.skipping = true;
-                self.start = self.end;
+                self.skip(self.unread().len());
             }
             return None;
         };
+        let at = searched + at;
         let good = !self.skipping && at <= max;
         self.skipping = false;
         let result = good.then(|| read(&self.unread()[..at]));

@@ -7,6 +7,7 @@
 //! [`ports`].
 #![cfg_attr(not(test), no_std)]
 
+pub mod answers;
 pub mod capture;
 mod checksum;
 pub mod command;
@@ -15,7 +16,6 @@ pub mod filters;
 pub mod inbox;
 pub mod lights;
 pub mod outbox;
-pub mod pending;
 pub mod ports;
 pub mod queue;
 pub mod recorder;

@@ -1,12 +1,16 @@
-//! Hands a message to the port, packet by packet.
+//! Hands messages to the port, packet by packet.
 
 use cantap_wire::framing::MAX_ENCODED;
 
+use crate::answers;
 use crate::ports::{PACKET, Port};
 
-/// The message on its way out.
+/// Room for all answers and a batch behind them.
+const ROOM: usize = answers::ROOM + MAX_ENCODED;
+
+/// What is on its way out.
 pub struct Outbox {
-    message: [u8; MAX_ENCODED],
+    bytes: [u8; ROOM],
     len: usize,
     sent: usize,
     /// The last packet was full: without a shorter one the host would wait for more.
@@ -16,7 +20,7 @@ pub struct Outbox {
 impl Outbox {
     /// Nothing to send.
     pub const fn new() -> Self {
-        Self { message: [0; MAX_ENCODED], len: 0, sent: 0, must_end: false }
+        Self { bytes: [0; ROOM], len: 0, sent: 0, must_end: false }
     }
 
     /// Forgets everything.
@@ -26,22 +30,22 @@ impl Outbox {
         self.must_end = false;
     }
 
-    /// Whether the next message can be filled in.
+    /// Whether it can be filled again.
     pub const fn is_empty(&self) -> bool {
         self.sent == self.len
     }
 
-    /// Lets `write` fill in the next message; it returns its length.
+    /// Lets `write` fill in what goes next; it returns its length.
     pub fn fill(&mut self, write: impl FnOnce(&mut [u8]) -> usize) {
-        self.len = write(&mut self.message).min(MAX_ENCODED);
+        self.len = write(&mut self.bytes).min(ROOM);
         self.sent = 0;
     }
 
-    /// Hands packets to the port until it takes no more or the message ends.
+    /// Hands packets to the port until it takes no more or all has gone.
     pub fn pump(&mut self, port: &mut impl Port) {
         while self.sent < self.len {
             let end = self.len.min(self.sent + PACKET);
-            if !port.write(&self.message[self.sent..end]) {
+            if !port.write(&self.bytes[self.sent..end]) {
                 return;
             }
             self.must_end = end - self.sent == PACKET;

@@ -60,10 +60,12 @@ pub trait Traffic {
     /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the
     /// oldest and drops the newest.
     fn take_overrun(&mut self) -> bool;
-    /// Requests transmission; frames leave in the order of these calls. Returns the mailbox, a number
-    /// below [`crate::transmit::MAILBOXES`], or
-    /// `None` if all are taken.
-    fn transmit(&mut self, frame: &Frame) -> Option<u8>;
+    /// Writes a frame to a free mailbox, where it waits for [`Self::request`] or is overwritten by the next. Returns the
+    /// mailbox, a number below [`crate::transmit::MAILBOXES`], or `None` if all are taken.
+    fn prepare(&mut self, frame: &Frame) -> Option<u8>;
+    /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
+    /// leave in the order of these calls.
+    fn request(&mut self, mailbox: u8);
     /// Takes one finished transmission: its mailbox and how it ended.
     fn take_finished(&mut self) -> Option<(u8, Outcome)>;
     /// Asks for every mailbox to be given up. Those that can still be are reported as

@@ -8,10 +8,10 @@ use cantap_wire::message::{read_send, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request};
 
 use crate::QUEUE_BYTES;
+use crate::answers::Answers;
 use crate::command::{Commands, Identity, Step, Work, send};
 use crate::inbox::Inbox;
 use crate::outbox::Outbox;
-use crate::pending::Pending;
 use crate::ports::{Board, PACKET, Port};
 use crate::queue::Consumer;
 use crate::sender::Sender;
@@ -52,7 +52,7 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     outbox: Outbox,
     language: Language,
     work: Option<(Work, Origin)>,
-    pending: Pending,
+    answers: Answers,
 }
 
 impl<'q, const N: usize> Session<'q, N> {
@@ -67,7 +67,7 @@ impl<'q, const N: usize> Session<'q, N> {
             outbox: Outbox::new(),
             language: Language::Unknown,
             work: None,
-            pending: Pending::new(),
+            answers: Answers::new(),
         }
     }
 
@@ -103,7 +103,7 @@ impl<'q, const N: usize> Session<'q, N> {
             self.language = Language::Unknown;
             self.inbox.clear();
             self.outbox.clear();
-            self.pending.clear();
+            self.answers.clear();
             self.begin(Work::Silence, Origin::Device, board);
         }
         self.look_after_work(board);
@@ -142,16 +142,17 @@ impl<'q, const N: usize> Session<'q, N> {
                     self.language = Language::Native { greeted: true };
                     self.outbox.clear();
                 }
-                self.pending.set(id, &result);
+                self.answers.add(id, &result);
             }
             Origin::Line => self.slcan.answer(if result.is_ok() { Answer::Ok } else { Answer::Refused }),
             Origin::Device => {}
         }
     }
 
-    /// Handles one request or line, unless something is still under way or unanswered. Returns whether there was one.
+    /// Handles one request or line, unless something is still under way or there is no room for its answer. Returns whether there
+    /// was one.
     fn handle_next(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        if self.work.is_some() || !self.pending.is_empty() || self.slcan.is_answering() {
+        if self.work.is_some() || !self.answers.have_room() || self.slcan.is_answering() {
             return false;
         }
         if self.language == Language::Unknown || self.inbox.first() == Some(0) {
@@ -215,7 +216,7 @@ impl<'q, const N: usize> Session<'q, N> {
         let mut frames = heapless::Vec::new();
         let Some((id, channel)) = read_send(message, &mut frames) else { return false };
         let queued = send(channel, &frames, board);
-        self.pending.set(id, &queued.map(|free| Reply::Queued { free }));
+        self.answers.add(id, &queued.map(|free| Reply::Queued { free }));
         true
     }
 
@@ -235,17 +236,17 @@ impl<'q, const N: usize> Session<'q, N> {
             }
         };
         match result {
-            Ok(Step::Done(reply)) => self.pending.set(id, &Ok(reply)),
+            Ok(Step::Done(reply)) => self.answers.add(id, &Ok(reply)),
             Ok(Step::Begun(work)) => {
                 if matches!(work, Work::Restart | Work::Bootloader) {
                     // It ends in a restart: the answer goes first.
-                    self.pending.set(id, &Ok(Reply::Done));
+                    self.answers.add(id, &Ok(Reply::Done));
                     self.work = Some((work, Origin::Device));
                 } else {
                     self.work = Some((work, Origin::Request(id)));
                 }
             }
-            Err(refusal) => self.pending.set(id, &Err(refusal)),
+            Err(refusal) => self.answers.add(id, &Err(refusal)),
         }
     }
 
@@ -270,18 +271,16 @@ impl<'q, const N: usize> Session<'q, N> {
         true
     }
 
-    /// Fills the empty outbox with what goes next: an answer, then what was captured. Returns whether there was something.
+    /// Fills the empty outbox with what goes next: the answers, and behind them what was captured. Returns whether there was
+    /// something.
     fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        let Self { queue, sender, slcan, outbox, pending, .. } = self;
+        let Self { queue, sender, slcan, outbox, answers, .. } = self;
         match self.language {
             Language::Unknown => {}
-            Language::Native { .. } => {
-                if pending.is_empty() {
-                    outbox.fill(|out| sender.next_batch(queue, board.now(), out));
-                } else {
-                    outbox.fill(|out| pending.take(out));
-                }
-            }
+            Language::Native { .. } => outbox.fill(|out| {
+                let answered = answers.take(out);
+                answered + sender.next_batch(queue, board.now(), &mut out[answered..])
+            }),
             Language::Slcan => outbox.fill(|out| slcan.next_lines(queue, out)),
         }
         !self.outbox.is_empty()

@@ -266,27 +266,39 @@ impl Transmitter {
     /// Whether something other than the queue's frames is waiting, for [`Self::service`].
     pub fn has_more(&self, now: u64) -> bool {
         let waiting = self.replies_waiting > 0 || self.periodic_waiting > 0 || self.dropping.is_some();
-        waiting || now >= self.periodic_due.max(self.look_from)
+        waiting || self.next_periodic().is_some_and(|due| due <= now)
     }
 
-    /// Fills free mailboxes with the queue's frames that are due, unless something else goes first. Returns whether there
-    /// was one.
+    /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
     #[inline]
-    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) -> bool {
-        let mut any = false;
-        if self.has_more(now) {
-            return any;
+    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
+        while let Some((mailbox, _)) = self.prepare_due(traffic, now, now) {
+            traffic.request(mailbox);
+            self.requested(mailbox);
         }
-        while let Some(&Queued { tag, frame, at }) = self.queue.front() {
-            // Whatever is in a mailbox must find room to be kept when it has finished.
-            let kept = self.unconfirmed.len() + self.mailboxes.iter().flatten().count();
-            if at > now || kept >= self.unconfirmed.capacity() || !self.load(tag, &frame, traffic) {
-                break;
-            }
-            self.queue.pop_front();
-            any = true;
+    }
+
+    /// Writes the queue's head to a mailbox if it is due `until` then, unless something else goes first. It is sent by
+    /// [`Traffic::request`], with [`Self::requested`] afterwards. Returns the mailbox and when it is due.
+    #[inline]
+    pub fn prepare_due(&mut self, traffic: &mut impl Traffic, now: u64, until: u64) -> Option<(u8, u64)> {
+        let &Queued { ref frame, at, .. } = self.queue.front()?;
+        // Whatever is in a mailbox must find room to be kept when it has finished.
+        let kept = self.unconfirmed.len() + self.mailboxes.iter().flatten().count();
+        if at > until || kept >= self.unconfirmed.capacity() || self.has_more(now) {
+            return None;
         }
-        any
+        Some((traffic.prepare(frame)?, at))
+    }
+
+    /// The queue's head is in this mailbox, and was requested.
+    #[inline]
+    pub fn requested(&mut self, mailbox: u8) {
+        if let (Some(place), Some(Queued { tag, frame, .. })) =
+            (self.mailboxes.get_mut(usize::from(mailbox)), self.queue.pop_front())
+        {
+            *place = Some((tag, frame));
+        }
     }
 
     /// Records what has finished, at `ended`; false if the queue has no room for all of it.
@@ -320,7 +332,7 @@ impl Transmitter {
             }
             self.dropping = None;
         }
-        if now >= self.periodic_due.max(self.look_from) {
+        if self.next_periodic().is_some_and(|due| due <= now) {
             self.start_due(recorder, now);
         }
         while self.replies_waiting > 0 {
@@ -342,6 +354,11 @@ impl Transmitter {
         (head != 0 && self.mailboxes.iter().any(Option::is_none)).then_some(head)
     }
 
+    /// When the periodic entries are to be looked at.
+    pub fn next_periodic(&self) -> Option<u64> {
+        (self.periodic_due != NEVER).then(|| self.periodic_due.max(self.look_from))
+    }
+
     /// The next time at which [`Self::service`] has something to do that no interrupt of the controller tells.
     pub fn next_due(&self) -> Option<u64> {
         // What waits for room in the record queue is tried again every millisecond; an alarm would come again and again and
@@ -349,12 +366,12 @@ impl Transmitter {
         if !self.unconfirmed.is_empty() || self.dropping.is_some() {
             return None;
         }
-        let due = self.next_queued().unwrap_or(NEVER).min(self.periodic_due.max(self.look_from));
-        (due != NEVER).then_some(due)
+        self.next_queued().into_iter().chain(self.next_periodic()).min()
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {
-        let Some(mailbox) = traffic.transmit(frame) else { return false };
+        let Some(mailbox) = traffic.prepare(frame) else { return false };
+        traffic.request(mailbox);
         if let Some(place) = self.mailboxes.get_mut(mailbox as usize) {
             *place = Some((tag, *frame));
         }

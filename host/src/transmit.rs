@@ -14,8 +14,9 @@ use cantap_wire::{CHANNELS, Channel, Command, Frame};
 use crate::device::{Pending, Transmission};
 use crate::{Device, DeviceError};
 
-/// Requests under way: with eight frames each, more than a bus takes in a USB round trip.
-const REQUESTS: usize = 4;
+/// Requests under way: with 20 frames each, more than both buses take in a USB round trip, and no more bytes than a device has
+/// room for.
+const REQUESTS: usize = 6;
 /// How long to wait for a confirmation before looking whether to go on.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Tags wrap here, far below the device's own and far above what is under way.

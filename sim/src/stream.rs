@@ -17,8 +17,8 @@ const MEGABIT: u32 = 1_000_000;
 /// The device's clock.
 const TICKS_PER_US: u64 = 12;
 const CYCLES_PER_TICK: u64 = CYCLES_PER_US / TICKS_PER_US;
-/// Requests of a channel under way.
-const REQUESTS: usize = 4;
+/// Requests of a channel under way: half of the host library's.
+const REQUESTS: usize = 3;
 /// From the plan to its first frame.
 const LEAD: u64 = 100 * MS;
 /// A stream of which nothing ends for so long, after its first frame, has come to a halt.

@@ -213,7 +213,7 @@ impl Traffic for CanTraffic {
         overrun
     }
 
-    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+    fn prepare(&mut self, frame: &Frame) -> Option<u8> {
         let tsr = self.can.tsr().read();
         // A mailbox whose outcome nobody has taken yet is empty, but not free.
         let free = [
@@ -246,12 +246,18 @@ impl Traffic for CanTraffic {
                 // SAFETY: a standard identifier has 11 bits, as the field.
                 unsafe { w.stid().bits(id.raw() as u16) };
             }
-            w.ide().bit(id.is_extended()).rtr().bit(frame.is_remote()).txrq().set_bit()
+            w.ide().bit(id.is_extended()).rtr().bit(frame.is_remote())
         });
+        Some(number as u8)
+    }
+
+    #[inline]
+    fn request(&mut self, mailbox: u8) {
+        let number = usize::from(mailbox).min(MAILBOXES - 1);
+        self.can.tx(number).tir().modify(|_, w| w.txrq().set_bit());
         self.requests[number] = self.next_request;
         self.next_request = self.next_request.wrapping_add(1);
         self.aborting[number] = false;
-        Some(number as u8)
     }
 
     fn take_finished(&mut self) -> Option<(u8, Outcome)> {

@@ -47,6 +47,7 @@ pub struct FakeTraffic {
     pub fifo: VecDeque<Frame>,
     pub overrun: bool,
     pub mailboxes: [Option<Frame>; 3],
+    pub prepared: Option<Frame>,
     /// The order in which mailboxes were filled.
     pub order: VecDeque<u8>,
     pub finished: VecDeque<(u8, Outcome)>,
@@ -84,15 +85,19 @@ impl Traffic for FakeTraffic {
         std::mem::take(&mut self.overrun)
     }
 
-    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+    fn prepare(&mut self, frame: &Frame) -> Option<u8> {
         let free = self.mailboxes.iter().position(Option::is_none)?;
         // A mailbox is free for the next frame only when its end was taken, as on the chip.
         if self.finished.iter().any(|(mailbox, _)| *mailbox as usize == free) {
             return None;
         }
-        self.mailboxes[free] = Some(*frame);
-        self.order.push_back(free as u8);
+        self.prepared = Some(*frame);
         Some(free as u8)
+    }
+
+    fn request(&mut self, mailbox: u8) {
+        self.mailboxes[mailbox as usize] = self.prepared.take();
+        self.order.push_back(mailbox);
     }
 
     fn take_finished(&mut self) -> Option<(u8, Outcome)> {

@@ -4,6 +4,7 @@ use core::fmt;
 use core::str::FromStr;
 
 use crate::Refusal;
+use crate::varint::take_u32;
 
 /// An identifier of 11 (standard) or 29 bits (extended).
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -90,12 +91,8 @@ impl Frame {
     #[inline]
     pub fn from_bus(id: Id, remote: bool, dlc: u8, data: [u8; 8]) -> Self {
         let dlc = dlc & 15;
-        let mut kept = [0; 8];
-        if !remote {
-            let len = dlc.min(8) as usize;
-            kept[..len].copy_from_slice(&data[..len]);
-        }
-        Self { id, remote, dlc, data: kept }
+        let len = if remote { 0 } else { dlc.min(8) as usize };
+        Self { id, remote, dlc, data: first(len, data) }
     }
 
     /// A frame whose parts are as [`Self::from_bus`] would make them: a DLC of four bits, and zeros beyond the data.
@@ -141,6 +138,29 @@ impl Frame {
     }
 }
 
+/// The first `len` bytes (at most 8), and zeros behind them.
+#[inline]
+pub(crate) fn first(len: usize, data: [u8; 8]) -> [u8; 8] {
+    // Shifts rather than a copy, which is a call where the length is not known.
+    let kept = if len >= 8 { u64::MAX } else { (1 << (8 * len)) - 1 };
+    (u64::from_le_bytes(data) & kept).to_le_bytes()
+}
+
+/// The first `len` bytes (at most 8) with zeros behind them, and what follows.
+#[inline]
+pub(crate) fn take_data(len: usize, bytes: &[u8]) -> Option<([u8; 8], &[u8])> {
+    let (data, rest) = bytes.split_at_checked(len.min(8))?;
+    Some(match bytes.first_chunk::<8>() {
+        // More follows than the data: eight bytes are read at once, and those that are not the frame's dropped.
+        Some(eight) => (first(len, *eight), rest),
+        None => {
+            let mut padded = [0; 8];
+            padded[..data.len()].copy_from_slice(data);
+            (padded, rest)
+        }
+    })
+}
+
 /// A frame inside a command or event: postcard's ordinary encoding of these three fields.
 #[derive(serde::Serialize, serde::Deserialize)]
 pub(crate) struct Packed {
@@ -165,16 +185,31 @@ impl From<Frame> for Packed {
 impl Packed {
     /// The frame, or what keeps it from being one.
     pub(crate) fn frame(&self) -> Result<Frame, Refusal> {
-        let raw = self.id & !(EXTENDED | PACKED_REMOTE);
-        let id = if self.id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
-        let id = id.ok_or(Refusal::BadId)?;
-        let remote = self.id & PACKED_REMOTE != 0;
         let mut data = [0; 8];
         data[..self.data.len()].copy_from_slice(&self.data);
-        let frame = Frame::from_bus(id, remote, self.dlc & 15, data);
-        let is_right = self.dlc <= 15 && frame.data_len() == self.data.len();
-        if is_right { Ok(frame) } else { Err(Refusal::BadDlc) }
+        unpack(self.id, self.dlc, self.data.len(), data)
     }
+}
+
+/// The frame with [`Packed`]'s fields, or what keeps it from being one.
+#[inline]
+fn unpack(id: u32, dlc: u8, len: usize, data: [u8; 8]) -> Result<Frame, Refusal> {
+    let raw = id & !(EXTENDED | PACKED_REMOTE);
+    let remote = id & PACKED_REMOTE != 0;
+    let id = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) }.ok_or(Refusal::BadId)?;
+    let frame = Frame::from_bus(id, remote, dlc & 15, data);
+    let is_right = dlc <= 15 && frame.data_len() == len;
+    if is_right { Ok(frame) } else { Err(Refusal::BadDlc) }
+}
+
+/// Reads a frame as [`Packed`] stands in a message, with what follows it, without serde: a streaming host sends thousands a
+/// second. `None` if it cannot be.
+pub(crate) fn take_packed(bytes: &[u8]) -> Option<(Frame, &[u8])> {
+    let (id, rest) = take_u32(bytes)?;
+    let (&[dlc, len], rest) = rest.split_first_chunk()?;
+    let len = usize::from(len);
+    let (data, rest) = take_data(len, rest).filter(|_| len <= 8)?;
+    Some((unpack(id, dlc, len, data).ok()?, rest))
 }
 
 impl TryFrom<Packed> for Frame {

@@ -12,6 +12,7 @@ pub mod framing;
 pub mod message;
 pub mod record;
 pub mod timing;
+mod varint;
 
 pub use decoder::{Corruption, Decoded, Decoder};
 pub use frame::{Frame, Id};

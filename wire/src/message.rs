@@ -5,14 +5,15 @@ use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
 use crate::batch::BatchHeader;
-use crate::frame::Packed;
+use crate::frame::{Packed, take_packed};
 use crate::record::{BusErrorKind, ErrorState};
+use crate::varint::{take_u32, take_u64};
 use crate::{BitTiming, CHANNELS, Channel, Frame, Id};
 
 /// Most filters that one channel takes; the hardware's banks may be exhausted earlier.
 pub const MAX_FILTERS: usize = 56;
 /// Most frames in one [`Command::Send`].
-pub const MAX_SEND: usize = 8;
+pub const MAX_SEND: usize = 20;
 /// Most modifiers of one periodic frame.
 pub const MAX_MODIFIERS: usize = 4;
 /// Tags from here up name frames that the device sends by itself: a periodic entry's slot, or
@@ -159,15 +160,20 @@ const SEND: u32 = 6;
 /// It is what a streaming host sends thousands of times a second: as a [`Request`] it would be moved about with room for the
 /// longest command.
 pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<(u16, Channel)> {
-    type Head = (u16, u32, Channel, usize);
-    let (id, command) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?.0;
+    let ((id, command), rest) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?;
     if command != SEND {
         return None;
     }
-    let ((_, _, channel, count), mut rest) = postcard::take_from_bytes::<Head>(request).ok()?;
+    let ((channel, count), mut rest) = postcard::take_from_bytes::<(Channel, usize)>(rest).ok()?;
     for _ in 0..count {
-        let (frame, behind) = postcard::take_from_bytes(rest).ok()?;
-        frames.push(frame).ok()?;
+        let (tag, behind) = take_u32(rest)?;
+        let (frame, behind) = take_packed(behind)?;
+        let (at_ticks, behind) = match *behind {
+            [0, ref behind @ ..] => (None, behind),
+            [1, ref behind @ ..] => take_u64(behind).map(|(at, behind)| (Some(at), behind))?,
+            _ => return None,
+        };
+        frames.push(TxFrame { tag, frame, at_ticks }).ok()?;
         rest = behind;
     }
     Some((id, channel))

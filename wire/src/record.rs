@@ -13,6 +13,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use crate::frame::take_data;
+use crate::varint::take_u32;
 use crate::{Channel, Frame, Id};
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
@@ -21,6 +23,8 @@ pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + 5 + 8;
 /// index, channel, tag, packed ID, DLC, length, data and time difference.
 pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + 5;
 
+/// The index of [`Event::Transmitted`].
+const TRANSMITTED: u8 = 6;
 const FRAME: u8 = 0x80;
 const QUALIFIED: u8 = 0x40;
 const QUALIFIER_MASK: u8 = 0xF8;
@@ -322,19 +326,7 @@ fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i32,
     let dlc = header & 15;
     let data_omitted = qualifiers & NO_DATA != 0;
     let data_len = if remote || data_omitted { 0 } else { dlc.min(8) as usize };
-    let (data, rest) = match (rest.split_first_chunk::<8>(), rest.split_at_checked(data_len)) {
-        // More follows than the data: eight bytes are read at once, and those that are not the frame's dropped.
-        (Some((eight, _)), Some((_, rest))) => {
-            let kept = if data_len == 8 { u64::MAX } else { (1 << (8 * data_len)) - 1 };
-            ((u64::from_le_bytes(*eight) & kept).to_le_bytes(), rest)
-        }
-        (None, Some((bytes, rest))) => {
-            let mut data = [0; 8];
-            data[..data_len].copy_from_slice(bytes);
-            (data, rest)
-        }
-        _ => return Err(BadRecord),
-    };
+    let (data, rest) = take_data(data_len, rest).ok_or(BadRecord)?;
     let channel = if header & 0x40 == 0 { Channel::Can1 } else { Channel::Can2 };
     let frame = Frame::from_clean_parts(id, remote, dlc, data);
     Ok((Record::Received(Received { channel, frame, stamp, data_omitted }), ticks, rest))
@@ -368,6 +360,14 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
             return Err(BadRecord);
         }
         return Ok(Outline { len, ticks, frame_of: Some(channel) });
+    }
+    // A confirmation: nearly all else, while a host streams.
+    if let [TRANSMITTED, _, ref rest @ ..] = *bytes {
+        let (_tag, rest) = take_u32(rest).ok_or(BadRecord)?;
+        let (_id, rest) = take_u32(rest).ok_or(BadRecord)?;
+        let &[_dlc, len, ref rest @ ..] = rest else { return Err(BadRecord) };
+        let (ticks, after) = decode_ticks(rest.get(usize::from(len)..).ok_or(BadRecord)?)?;
+        return Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of: None });
     }
     let (record, ticks, after) = decode(bytes)?;
     let frame_of = match record {
@@ -412,6 +412,21 @@ mod tests {
             let ticks = if received.stamp == Stamp::Omitted { 0 } else { ticks };
             prop_assert_eq!(decode(&bytes), Ok((Record::Received(received), ticks, &tail[..])));
             prop_assert_eq!(outline(&bytes), Ok(Outline { len, ticks, frame_of: Some(received.channel) }));
+        }
+
+        #[test]
+        fn a_confirmation_s_outline_says_what_decoding_says(
+            received in received(),
+            tag: u32,
+            ticks: i32,
+            tail: Vec<u8>,
+        ) {
+            let event = Event::Transmitted { channel: received.channel, tag, frame: received.frame };
+            let mut out = [0; MAX_RECORD];
+            let len = encode_event(&event, ticks, &mut out);
+            let bytes = [&out[..len], &tail].concat();
+            prop_assert_eq!(decode(&bytes), Ok((Record::Event(event), ticks, &tail[..])));
+            prop_assert_eq!(outline(&bytes), Ok(Outline { len, ticks, frame_of: None }));
         }
 
         #[test]

@@ -320,8 +320,9 @@ fn frames_to_be_sent_are_read_as_the_request_has_them_and_no_other_request_is() 
             assert_eq!(read(&request[..cut]), None, "{cut} bytes of {count} frames");
         }
     }
-    let nine = [&[5, 6, 0, 9][..], &[1, 1, 0, 0, 0].repeat(9)].concat();
-    assert_eq!(read(&nine), None);
+    let too_many = MAX_SEND + 1;
+    let one_more = [&[5, 6, 0, too_many as u8][..], &[1, 1, 0, 0, 0].repeat(too_many)].concat();
+    assert_eq!(read(&one_more), None);
     assert_eq!(read(&encoded(5, Command::Close { channel: Can1 })), None);
 }
 

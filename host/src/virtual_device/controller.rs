@@ -55,6 +55,8 @@ pub struct Controller {
     mailboxes: [Option<Frame>; MAILBOXES],
     /// Mailboxes in the order in which they were filled.
     order: VecDeque<u8>,
+    /// Written to a mailbox and not requested.
+    prepared: Option<Frame>,
     finished: VecDeque<(u8, Outcome)>,
     /// The first of `order` is on the bus.
     sending: bool,
@@ -84,6 +86,7 @@ impl Controller {
             overrun: false,
             mailboxes: [None; MAILBOXES],
             order: VecDeque::with_capacity(MAILBOXES),
+            prepared: None,
             finished: VecDeque::with_capacity(MAILBOXES),
             sending: false,
             aborting: false,
@@ -295,16 +298,21 @@ impl Traffic for TrafficSide {
         std::mem::take(&mut self.0.borrow_mut().overrun)
     }
 
-    fn transmit(&mut self, frame: &Frame) -> Option<u8> {
+    fn prepare(&mut self, frame: &Frame) -> Option<u8> {
         let mut controller = self.0.borrow_mut();
         let taken = |mailbox: usize| {
             controller.mailboxes[mailbox].is_some()
                 || controller.finished.iter().any(|(finished, _)| usize::from(*finished) == mailbox)
         };
         let free = (0..MAILBOXES).find(|mailbox| !taken(*mailbox))?;
-        controller.mailboxes[free] = Some(*frame);
-        controller.order.push_back(free as u8);
+        controller.prepared = Some(*frame);
         Some(free as u8)
+    }
+
+    fn request(&mut self, mailbox: u8) {
+        let mut controller = self.0.borrow_mut();
+        controller.mailboxes[usize::from(mailbox)] = controller.prepared.take();
+        controller.order.push_back(mailbox);
     }
 
     fn take_finished(&mut self) -> Option<(u8, Outcome)> {

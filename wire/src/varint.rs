@@ -1,0 +1,57 @@
+//! postcard's unsigned integers, for what is read thousands of times a second: seven bits a byte, the low ones first, and
+//! bit 7 set in all bytes but the last.
+
+/// Bytes of the longest `u32`.
+const MAX_U32: usize = 5;
+
+/// Reads a `u64`, with what follows it.
+#[inline]
+pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
+    let mut value = 0;
+    for (index, &byte) in bytes.iter().enumerate() {
+        let bits = u64::from(byte & 0x7F);
+        let shift = 7 * index as u32;
+        // Ten bytes have room for more than 64 bits.
+        if shift >= u64::BITS || bits > u64::MAX >> shift {
+            return None;
+        }
+        value |= bits << shift;
+        if byte < 0x80 {
+            return Some((value, &bytes[index + 1..]));
+        }
+    }
+    None
+}
+
+/// Reads a `u32`, with what follows it.
+#[inline]
+pub(crate) fn take_u32(bytes: &[u8]) -> Option<(u32, &[u8])> {
+    let (value, rest) = take_u64(bytes)?;
+    let is_short = bytes.len() - rest.len() <= MAX_U32;
+    Some((u32::try_from(value).ok().filter(|_| is_short)?, rest))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn encoded(value: u64) -> Vec<u8> {
+        postcard::to_slice(&value, &mut [0; 10]).unwrap().to_vec()
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_are_what_postcard_says(
+            bytes in prop_oneof![
+                proptest::collection::vec(any::<u8>(), 0..12),
+                // Long ones, many of them too long.
+                proptest::collection::vec(0x7E..0x82u8, 0..12),
+                (any::<u64>(), 0..64u32).prop_map(|(value, bits)| encoded(value >> bits)),
+            ],
+        ) {
+            prop_assert_eq!(take_u32(&bytes), postcard::take_from_bytes(&bytes).ok());
+            prop_assert_eq!(take_u64(&bytes), postcard::take_from_bytes(&bytes).ok());
+        }
+    }
+}

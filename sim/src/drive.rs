@@ -1,7 +1,7 @@
 //! What the firmware does to a bus, measured on the bus itself: how soon it replies, how well it keeps times, how
 //! much it can send. For tests, which hold it against limits, and for the benchmark, which prints it.
 
-use cantap_wire::message::{Filter, FrameKind, Periodic, Trigger};
+use cantap_wire::message::{Checksum, Filter, FrameKind, Modifier, Periodic, Trigger};
 use cantap_wire::{Channel, Command, Frame, Id};
 
 use crate::CYCLES_PER_US;
@@ -86,6 +86,66 @@ pub fn periodic_jitter(rig: &mut Rig, period_us: u64) -> Result<Option<Range>, R
     // The first was on the bus before the watch began, perhaps.
     let whole = starts.len() as u64 >= COUNT - 1;
     Ok(Range::of(starts.windows(2).map(|pair| (pair[1] - pair[0]) as i64 - period)).filter(|_| whole))
+}
+
+/// How two channels kept the periods of full tables.
+#[derive(Clone, Copy, Debug)]
+pub struct Tables {
+    /// Start of each frame less when it was due by its entry's first: what another frame kept it waiting.
+    pub late: Range,
+    /// Frames that crossed the buses.
+    pub frames: usize,
+    /// Frames of which a modifier's byte is not what it should be.
+    pub wrong: usize,
+}
+
+/// Fills every periodic entry of both channels, which are on buses of their own, with frames of eight bytes that count and carry a
+/// checksum, and watches for so long. Each entry's period is 13 µs longer than that of the one before, so that all of them
+/// meet. `None` if an entry left out a frame.
+pub fn periodic_tables(rig: &mut Rig, shortest_us: u64, watch_us: u64) -> Result<Option<Tables>, RigError> {
+    let period_us = |slot: usize| shortest_us + 13 * slot as u64;
+    let modifiers = [
+        Modifier::Counter { byte: 0, low_bit: 0, bits: 4 },
+        Modifier::Checksum { byte: 7, algorithm: Checksum::Xor },
+    ];
+    let id = |slot: usize| 0x100 + slot as u32;
+    for slot in 0..rig.periodic_slots() {
+        for channel in Channel::ALL {
+            let frame = Frame::from_bus(Id::standard_truncated(id(slot)), false, 8, [0; 8]);
+            let modifiers = modifiers.into_iter().collect();
+            let period_ticks = (period_us(slot) * TICKS_PER_US) as u32;
+            let entry = Periodic { frame, period_ticks, count: 0, modifiers };
+            rig.ask(Command::SetPeriodic { channel, slot: slot as u8, entry: Some(entry) })?;
+        }
+    }
+    rig.watch();
+    rig.run_for(watch_us * CYCLES_PER_US)?;
+    let watched = rig.take_watched();
+    let (mut late, mut frames, mut wrong) = (Vec::new(), 0, 0);
+    for channel in Channel::ALL {
+        for slot in 0..rig.periodic_slots() {
+            let own = |frame: &&BusFrame| {
+                frame.sender == Member::Controller(channel.index())
+                    && frame.error.is_none()
+                    && frame.frame.id().raw() == id(slot)
+            };
+            let crossed: Vec<&BusFrame> = watched[channel.index()].iter().filter(own).collect();
+            // The watch may begin and end between two of them.
+            if (crossed.len() as u64) < watch_us / period_us(slot) - 1 {
+                return Ok(None);
+            }
+            frames += crossed.len();
+            let period = period_us(slot) * CYCLES_PER_US;
+            // None leaves early, so the least late one tells when they were due.
+            let phases = crossed.iter().zip(0..).map(|(frame, n)| frame.start as i64 - (n * period) as i64);
+            let due = phases.clone().min().unwrap_or(0);
+            late.extend(phases.map(|phase| phase - due));
+            let data = |frame: &BusFrame| frame.frame.padded_data();
+            wrong += crossed.iter().filter(|frame| data(frame)[7] != data(frame)[0]).count();
+            wrong += crossed.windows(2).filter(|two| (data(two[0])[0] + 1) % 16 != data(two[1])[0]).count();
+        }
+    }
+    Ok(Range::of(late.into_iter()).map(|late| Tables { late, frames, wrong }))
 }
 
 fn frame(id: u32) -> Frame {

@@ -89,6 +89,7 @@ pub struct Rig {
     last_bytes_at: u64,
     /// Places in each channel's transmit queue, once the device has said.
     tx_queue: usize,
+    periodic_slots: usize,
     /// What crossed the buses, if it is kept.
     watched: Option<[Vec<BusFrame>; CHANNELS]>,
     /// Bits of frames on each bus, with intermission, as long as it was booked.
@@ -112,6 +113,7 @@ impl Rig {
             events: Vec::new(),
             last_bytes_at: 0,
             tx_queue: 0,
+            periodic_slots: 0,
             watched: None,
             bus_bits: [0; CHANNELS],
             recording: None,
@@ -249,6 +251,7 @@ impl Rig {
         };
         self.between_sessions = false;
         self.tx_queue = hello.tx_queue.into();
+        self.periodic_slots = hello.periodic_slots.into();
         self.follow_clock(hello.tick_hz);
         Ok(hello)
     }
@@ -399,6 +402,11 @@ impl Rig {
     /// Places in each channel's transmit queue.
     pub fn tx_queue(&self) -> usize {
         self.tx_queue
+    }
+
+    /// Periodic entries of each channel.
+    pub fn periodic_slots(&self) -> usize {
+        self.periodic_slots
     }
 
     /// The core cycle of the device's tick 0.

@@ -30,6 +30,10 @@ pub fn run() -> Result<()> {
     };
     line("reply after the frame's end, us", one(&|rig| Ok(range(drive::reply_latency(rig)?)))?);
     line("period of 1 ms off by, us", one(&|rig| Ok(range(drive::periodic_jitter(rig, 1000)?)))?);
+    // Three tenths of a second: each entry's frame about sixty times.
+    let tables = drive::periodic_tables(&mut rig(Other::Joined)?, 5_000, 300_000)?;
+    let tables = tables.filter(|tables| tables.wrong == 0).map(|tables| tables.late);
+    line("32 periods of 5.0 to 5.4 ms, late, us", [String::new(), String::new(), range(tables)]);
     for load in [10.0, 30.0, 60.0, 90.0, 98.0] {
         let measure = |other| -> Result<Option<Vec<Replayed>>> {
             let channels = if other == Other::Joined { &Channel::ALL[..] } else { &[Can1] };

@@ -150,15 +150,13 @@ pub(crate) fn first(len: usize, data: [u8; 8]) -> [u8; 8] {
 #[inline]
 pub(crate) fn take_data(len: usize, bytes: &[u8]) -> Option<([u8; 8], &[u8])> {
     let (data, rest) = bytes.split_at_checked(len.min(8))?;
-    Some(match bytes.first_chunk::<8>() {
+    if let Some(eight) = bytes.first_chunk::<8>() {
         // More follows than the data: eight bytes are read at once, and those that are not the frame's dropped.
-        Some(eight) => (first(len, *eight), rest),
-        None => {
-            let mut padded = [0; 8];
-            padded[..data.len()].copy_from_slice(data);
-            (padded, rest)
-        }
-    })
+        return Some((first(len, *eight), rest));
+    }
+    let mut padded = [0; 8];
+    padded[..data.len()].copy_from_slice(data);
+    Some((padded, rest))
 }
 
 /// A frame inside a command or event: postcard's ordinary encoding of these three fields.

@@ -127,7 +127,7 @@ fn commands() {
         .collect(),
     };
     let tx = |tag, at_ticks| TxFrame { tag, frame, at_ticks };
-    for (command, expected) in [
+    for (command, expected) in vec![
         (Command::Hello { protocol: 2 }, "00 02"),
         (Command::Open { channel, config: None }, "01 01 00"),
         (Command::Open { channel, config: Some(config) }, "01 01 01 ac 02 0d 02 01 00 01 00 00 00"),

@@ -6,11 +6,12 @@ use std::io;
 
 use cantap_wire::{Frame, Id};
 
+use super::error_frames::ErrorFrames;
 use super::input::Input;
 use super::interfaces::{self, Interfaces};
 use super::issue::Fault;
 use super::line::{Line, Seconds};
-use super::reader::{BATCH, DETAILS_LEFT_OUT, Decode, Found};
+use super::reader::{BATCH, Decode, Found};
 use super::text::{self, NS_PER_S};
 use super::writer::{Encode, LeftOut};
 use crate::socketcan::{BUS_ERROR, ERROR_FLAG, ErrorFrame};
@@ -22,11 +23,8 @@ const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEE
 #[derive(Default)]
 pub(crate) struct Decoder {
     interfaces: Interfaces,
-    /// A second event of the last line.
-    pending: Option<TraceRecord>,
+    error_frames: ErrorFrames,
     lengths: Lengths,
-    /// Error frames whose details are left out, to be told.
-    details: u64,
     /// The last line looked whole and had no line end.
     end_missing: bool,
     /// The last second's digits and time: most lines are in the same second as the one before.
@@ -36,12 +34,8 @@ pub(crate) struct Decoder {
 
 impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
-        if let Some(record) = self.pending.take() {
-            return Ok(Found::Record(record));
-        }
-        if let Some(details) = self.details.checked_sub(1) {
-            self.details = details;
-            return Ok(Found::Note(DETAILS_LEFT_OUT));
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
         }
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
@@ -55,7 +49,7 @@ impl Decode for Decoder {
                     if let Some(frame) = record.frame().filter(|frame| !frame.is_remote()) {
                         self.lengths.note(frame);
                     }
-                    self.pending = second.map(|event| TraceRecord { event, ..record });
+                    self.error_frames.keep(second.map(|event| TraceRecord { event, ..record }));
                     Found::Record(record)
                 }
                 Err(fault) => line.issue(fault),
@@ -70,7 +64,7 @@ impl Decode for Decoder {
     /// Lines exactly as candump writes them are read where they are in the buffer; the others one by one.
     fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
         loop {
-            if self.pending.is_none() {
+            if self.error_frames.is_empty() {
                 let (mut used, mut lines) = (0, 0);
                 let buffered = input.buffered();
                 while records.len() < BATCH
@@ -175,9 +169,7 @@ impl Decoder {
         let channel = self.interfaces.channel(interface);
         if id.len() == 8 && raw & ERROR_FLAG != 0 {
             let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
-            let frame = ErrorFrame { classes: raw & (ERROR_FLAG - 1), data: bytes };
-            self.details += u64::from(!frame.is_told_whole());
-            let (event, second) = frame.events();
+            let (event, second) = self.error_frames.read(raw, bytes);
             return Ok((TraceRecord { time_ns, channel, event }, second));
         }
         let id = match id.len() {

@@ -10,13 +10,14 @@ use std::io;
 use cantap_wire::{Frame, Id};
 
 use super::analyser;
+use super::error_frames::ErrorFrames;
 use super::event_text::EventText;
 use super::input::Input;
 use super::issue::{Fault, Place};
-use super::reader::{DETAILS_LEFT_OUT, Decode, Found};
+use super::reader::{Decode, Found};
 use super::text::{self, NS_PER_S};
 use super::writer::{Encode, LeftOut};
-use crate::socketcan::{ERROR_FLAG, ErrorFrame};
+use crate::socketcan::ErrorFrame;
 use crate::{Direction, TraceEvent, TraceRecord};
 
 /// Which columns.
@@ -41,19 +42,13 @@ pub(crate) struct Decoder {
     /// Lines before the head that may be the analyser's comments, and what is wrong if they are not.
     comments: u32,
     no_head: Option<(Place, Fault)>,
-    pending: Option<TraceRecord>,
-    /// Error frames whose details are left out, to be told.
-    details: u64,
+    error_frames: ErrorFrames,
 }
 
 impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
-        if let Some(record) = self.pending.take() {
-            return Ok(Found::Record(record));
-        }
-        if let Some(details) = self.details.checked_sub(1) {
-            self.details = details;
-            return Ok(Found::Note(DETAILS_LEFT_OUT));
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
         }
         while let Some(line) = input.line()? {
             let text = line.text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(line.text).trim_ascii();
@@ -62,7 +57,7 @@ impl Decode for Decoder {
             }
             let result = match self.dialect {
                 None => self.head(text),
-                Some(CsvDialect::PythonCan) => python_can(text, &mut self.details),
+                Some(CsvDialect::PythonCan) => python_can(text, &mut self.error_frames),
                 Some(CsvDialect::Full) => full(text).map(|record| Some((record, None))),
                 Some(CsvDialect::Analyser) => self.analyser.line(text, line.terminated),
             };
@@ -71,7 +66,7 @@ impl Decode for Decoder {
             }
             match result {
                 Ok(Some((record, second))) => {
-                    self.pending = second.map(|event| TraceRecord { event, ..record });
+                    self.error_frames.keep(second.map(|event| TraceRecord { event, ..record }));
                     return Ok(Found::Record(record));
                 }
                 Ok(None) => {}
@@ -118,7 +113,7 @@ impl Decoder {
             self.dialect = Some(CsvDialect::Analyser);
         } else {
             // Without its head a table is most likely one of python-can's columns, cut out of a file.
-            let row = python_can(line, &mut self.details);
+            let row = python_can(line, &mut self.error_frames);
             if row.is_ok() {
                 self.dialect = Some(CsvDialect::PythonCan);
                 return row;
@@ -143,8 +138,7 @@ fn columns<const N: usize>(line: &[u8]) -> Result<[&[u8]; N], Fault> {
     if count == N { Ok(columns) } else { Err(Fault::malformed(format!("{N} columns"), line)) }
 }
 
-/// `details` counts error frames that say more than is kept.
-fn python_can(line: &[u8], details: &mut u64) -> Result<Row, Fault> {
+fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault> {
     let [time, id, extended, remote, error, dlc, data] = columns(line)?;
     let time_ns = python_time(time).ok_or_else(|| Fault::malformed("a time in seconds", time))?;
     let digits = id.strip_prefix(b"0x").unwrap_or(id);
@@ -155,9 +149,7 @@ fn python_can(line: &[u8], details: &mut u64) -> Result<Row, Fault> {
     padded[..present].copy_from_slice(&bytes[..present]);
     let record = |event| TraceRecord { time_ns, channel: 1, event };
     if error == b"1" {
-        let frame = ErrorFrame { classes: raw & (ERROR_FLAG - 1), data: padded };
-        *details += u64::from(!frame.is_told_whole());
-        let (event, second) = frame.events();
+        let (event, second) = error_frames.read(raw, padded);
         return Ok(Some((record(event), second)));
     }
     let parsed = if extended == b"1" { Id::extended(raw) } else { Id::standard(raw) };

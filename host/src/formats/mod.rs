@@ -14,6 +14,7 @@ mod candump;
 mod compressed;
 mod csv;
 mod dif;
+mod error_frames;
 mod event_text;
 mod format;
 mod input;

@@ -93,10 +93,16 @@ mod tests {
         let fd = [0, 0, 1, 0x23, 2, 4, 0, 0, 0xAB, 0xCD, 0, 0];
         let options = [0, 2, 0, 4, 0, 0, 0, 2, 0, 4, 0, 8, 0, 0, 0, 0, 0, 0, 0, 4, 0, 0, 0, 0];
         block(6, &[&head[..], &fd, &options].concat());
+        // And four more, then an error frame that says two things: error-passive, by a stuff error.
+        let error = [0x20, 0, 0, 0x8C, 8, 0, 0, 0, 0, 0x20, 4, 0, 0, 0, 0, 0];
+        let head = [0_u32, 0, 1_500_000, 16, 16].map(u32::to_be_bytes).concat();
+        block(6, &[&head[..], &error, &options].concat());
         let (records, issues) = tests::read(Format::Pcapng, &file);
         assert_eq!(
             tests::write(Format::Candump, &records),
-            "(1.500000) can0 00000123#ABCD\n(1.500000) can0 20000084#0001040000000000\n"
+            "(1.500000) can0 00000123#ABCD\n(1.500000) can0 20000084#0001040000000000\n\
+             (1.500000) can0 20000084#0001040000000000\n(1.500000) can0 20000084#0020000000000000\n\
+             (1.500000) can0 20000088#0000040000000000\n"
         );
         assert_eq!(issues, ["test, offset 0x5c: a CAN FD frame cannot be represented and is left out"]);
     }

@@ -48,10 +48,6 @@ pub(crate) enum Found {
 pub(crate) const REQUESTS_TO_SEND: &str =
     "requests to send were passed over: what was sent is in the trace again as sent";
 
-/// Of SocketCAN's error frames.
-pub(crate) const DETAILS_LEFT_OUT: &str =
-    "error frames say more than their kind, the state and the counters, which is left out";
-
 /// The reading half of a format.
 pub(crate) trait Decode: Send {
     /// The next record or issue. Errors are those of the system.

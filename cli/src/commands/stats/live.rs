@@ -1,6 +1,6 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
-use std::io::{IsTerminal, Write};
+use std::io::IsTerminal;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, bail};
@@ -92,8 +92,7 @@ impl Lines {
 
     fn window(&mut self, window: &Window) {
         if self.shown {
-            // A closed standard error must not end the measurement.
-            let _ = writeln!(std::io::stderr(), "{}", line(window, self.colour));
+            eprintln!("{}", line(window, self.colour));
         }
     }
 }

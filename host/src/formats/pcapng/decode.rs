@@ -4,17 +4,18 @@ use std::io;
 
 use cantap_wire::{Frame, Id};
 
+use super::super::error_frames::ErrorFrames;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::interfaces::Interfaces;
 use super::super::issue::{Fault, Place};
-use super::super::reader::{DETAILS_LEFT_OUT, Decode, Found};
+use super::super::reader::{Decode, Found};
 use super::super::text::NS_PER_S;
 use super::{
     BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED,
     IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OBSOLETE_PACKET, OUTBOUND, REMOTE,
     SECTION_HEADER, SIMPLE_PACKET,
 };
-use crate::socketcan::{ERROR_FLAG, ErrorFrame};
+use crate::socketcan::ERROR_FLAG;
 use crate::{Direction, TraceEvent, TraceRecord};
 
 /// Longest block of a trace; far above what a CAN packet takes.
@@ -29,10 +30,7 @@ pub(crate) struct Decoder {
     started: bool,
     interfaces: Vec<Interface>,
     names: Interfaces,
-    /// Records that the last packet told beside its first.
-    pending: Option<TraceRecord>,
-    /// Error frames whose details are left out, to be told.
-    details: u64,
+    error_frames: ErrorFrames,
 }
 
 /// What an interface description says.
@@ -91,12 +89,8 @@ impl Decode for Decoder {
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
-        if let Some(record) = self.pending.take() {
-            return Ok(Found::Record(record));
-        }
-        if let Some(details) = self.details.checked_sub(1) {
-            self.details = details;
-            return Ok(Found::Note(DETAILS_LEFT_OUT));
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
         }
         loop {
             let place = Place::Offset(input.offset());
@@ -296,21 +290,21 @@ impl Decoder {
             [_, _, _, _, len, kind, ..] if kind & FD_FORMAT != 0 || *len > 8 => {
                 Err(Fault::Unsupported("a CAN FD frame".into()))
             }
-            _ => event(packet, flags, &mut self.details),
+            _ => event(packet, flags, &mut self.error_frames),
         };
         match event {
             Ok((event, second)) => {
                 // Our own error frame for a loss has the same count, and says more.
                 if dropped > 0 && !matches!(event, TraceEvent::Lost { .. }) {
-                    self.pending = Some(record(event));
+                    self.error_frames.keep([event].into_iter().chain(second).map(record));
                     return Ok(lost);
                 }
-                self.pending = second.map(record);
+                self.error_frames.keep(second.map(record));
                 Ok(record(event))
             }
             Err(fault) => {
                 if dropped > 0 {
-                    self.pending = Some(lost);
+                    self.error_frames.keep([lost]);
                 }
                 Err(fault)
             }
@@ -318,18 +312,20 @@ impl Decoder {
     }
 }
 
-/// What a classical packet says. `details` counts error frames that say more than is kept.
+/// What a classical packet says.
 #[inline]
-fn event(packet: &[u8], flags: u32, details: &mut u64) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
+fn event(
+    packet: &[u8],
+    flags: u32,
+    error_frames: &mut ErrorFrames,
+) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
     let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
     let (len, raw_dlc) = (packet[4], packet[7]);
     let mut data = [0; 8];
     let present = packet[8..].len().min(usize::from(len)).min(8);
     data[..present].copy_from_slice(&packet[8..8 + present]);
     if id & ERROR_FLAG != 0 {
-        let frame = ErrorFrame { classes: id & (ERROR_FLAG - 1), data };
-        *details += u64::from(!frame.is_told_whole());
-        return Ok(frame.events());
+        return Ok(error_frames.read(id, data));
     }
     let remote = id & REMOTE != 0;
     if present < usize::from(len) && !remote {

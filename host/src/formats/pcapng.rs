@@ -101,7 +101,7 @@ mod tests {
         assert_eq!(
             tests::write(Format::Candump, &records),
             "(1.500000) can0 00000123#ABCD\n(1.500000) can0 20000084#0001040000000000\n\
-             (1.500000) can0 20000084#0001040000000000\n(1.500000) can0 20000084#0020000000000000\n\
+             (1.500000) can0 20000084#0001040000000000\n(1.500000) can0 20000084#0030000000000000\n\
              (1.500000) can0 20000088#0000040000000000\n"
         );
         assert_eq!(issues, ["test, offset 0x5c: a CAN FD frame cannot be represented and is left out"]);

@@ -1,0 +1,69 @@
+//! Requests and answers as bytes, where a value with room for the longest would be moved about, or cannot be made.
+
+use heapless::Vec;
+
+use super::{Filter, MAX_SEND, Refusal, Reply, TxFrame};
+use crate::Channel;
+use crate::frame::{Packed, take_packed};
+use crate::varint::{take_u32, take_u64};
+
+/// The index of [`Command::Send`], as the pinned bytes have it.
+const SEND: u32 = 6;
+
+/// Reads a request that is a [`Command::Send`] into `frames`, which is empty, and returns its id and channel. `None` if it is
+/// another or cannot be read; what is in `frames` then means nothing.
+///
+/// It is what a streaming host sends thousands of times a second: as a [`Request`] it would be moved about with room for the
+/// longest command.
+pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<(u16, Channel)> {
+    let ((id, command), rest) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?;
+    if command != SEND {
+        return None;
+    }
+    let ((channel, count), mut rest) = postcard::take_from_bytes::<(Channel, usize)>(rest).ok()?;
+    for _ in 0..count {
+        let (tag, behind) = take_u32(rest)?;
+        let (frame, behind) = take_packed(behind)?;
+        let (at_ticks, behind) = match *behind {
+            [0, ref behind @ ..] => (None, behind),
+            [1, ref behind @ ..] => take_u64(behind).map(|(at, behind)| (Some(at), behind))?,
+            _ => return None,
+        };
+        frames.push(TxFrame { tag, frame, at_ticks }).ok()?;
+        rest = behind;
+    }
+    Some((id, channel))
+}
+
+/// Writes a [`DeviceMessage::Response`] to `out` and returns its length, `None` if there is no room. The answer stays where
+/// it is: a [`Response`] that is moved about has room for the longest.
+pub fn write_response(id: u16, result: &Result<Reply, Refusal>, out: &mut [u8]) -> Option<usize> {
+    /// The variant's index, as the pinned bytes have it.
+    const RESPONSE: u32 = 1;
+    postcard::to_slice(&(RESPONSE, id, result), out).ok().map(|written| written.len())
+}
+
+/// Why a request, sealed as it was sent, cannot be read: [`Refusal::BadId`] or [`Refusal::BadDlc`] where it carries a frame
+/// that cannot be, else [`Refusal::Malformed`].
+pub fn why_unreadable(request: &[u8]) -> Refusal {
+    // The indices of the other commands that carry frames, as the pinned bytes have them.
+    const SET_PERIODIC: u32 = 8;
+    const SET_TRIGGER: u32 = 9;
+    type Head = (u16, u32, Channel);
+    let fault = || {
+        let ((_, command, _), rest) = postcard::take_from_bytes::<Head>(request).ok()?;
+        match command {
+            SEND => {
+                type Frames = Vec<(u32, Packed, Option<u64>), MAX_SEND>;
+                let (frames, _) = postcard::take_from_bytes::<Frames>(rest).ok()?;
+                frames.iter().find_map(|(_, frame, _)| frame.frame().err())
+            }
+            SET_PERIODIC => postcard::take_from_bytes::<(u8, u8, Packed)>(rest).ok()?.0.2.frame().err(),
+            SET_TRIGGER => {
+                postcard::take_from_bytes::<(u8, u8, Filter, Packed)>(rest).ok()?.0.3.frame().err()
+            }
+            _ => None,
+        }
+    };
+    fault().unwrap_or(Refusal::Malformed)
+}

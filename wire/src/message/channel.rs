@@ -1,0 +1,98 @@
+//! How a channel takes part in a bus, and what it lets pass.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{BitTiming, Frame, Id};
+
+/// How a channel takes part in its bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Mode {
+    /// Sends nothing at all, no acknowledge either.
+    ListenOnly,
+    /// Acknowledges, transmits.
+    Normal,
+    /// Sends and receives its own frames; hears nothing from the bus.
+    Loopback,
+    /// As [`Mode::Loopback`], but the bus sees nothing.
+    SilentLoopback,
+}
+
+impl Mode {
+    /// Whether frames can be sent in this mode.
+    pub const fn transmits(self) -> bool {
+        !matches!(self, Mode::ListenOnly)
+    }
+}
+
+/// What [`Command::Open`] applies.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct ChannelConfig {
+    /// Bit timing.
+    pub timing: BitTiming,
+    /// Mode.
+    pub mode: Mode,
+    /// No automatic retransmission.
+    pub one_shot: bool,
+    /// Leave bus-off only by [`Command::Recover`].
+    pub manual_recovery: bool,
+    /// Leave received frames' data bytes out of the stream.
+    pub omit_data: bool,
+    /// Leave received frames' stamps out of the stream.
+    pub omit_stamps: bool,
+}
+
+impl ChannelConfig {
+    /// Listen-only with this timing and nothing left out.
+    pub const fn listen_only(timing: BitTiming) -> Self {
+        Self {
+            timing,
+            mode: Mode::ListenOnly,
+            one_shot: false,
+            manual_recovery: false,
+            omit_data: false,
+            omit_stamps: false,
+        }
+    }
+}
+
+/// Which frames a filter lets through, beside the identifier.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum FrameKind {
+    /// Data frames.
+    Data,
+    /// Remote frames.
+    Remote,
+    /// Both.
+    Any,
+}
+
+/// A frame passes if its identifier has the same length and agrees with `id` in every bit of `mask`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Filter {
+    /// 29-bit identifiers rather than 11-bit ones.
+    pub extended: bool,
+    /// Data frames, remote frames or both.
+    pub kind: FrameKind,
+    /// Identifier.
+    pub id: u32,
+    /// Bits that count.
+    pub mask: u32,
+}
+
+impl Filter {
+    /// Whether identifier and mask have no more bits than identifiers of this length.
+    pub const fn is_valid(&self) -> bool {
+        let widest = if self.extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+        self.id <= widest && self.mask <= widest
+    }
+
+    /// Whether this filter lets `frame` pass.
+    pub fn matches(&self, frame: &Frame) -> bool {
+        let kind = match self.kind {
+            FrameKind::Data => !frame.is_remote(),
+            FrameKind::Remote => frame.is_remote(),
+            FrameKind::Any => true,
+        };
+        kind && frame.id().is_extended() == self.extended && (frame.id().raw() ^ self.id) & self.mask == 0
+    }
+}

@@ -1,0 +1,88 @@
+//! Frames to be sent: once, again and again, in reply.
+
+use heapless::Vec;
+use serde::{Deserialize, Serialize};
+
+use super::Filter;
+use crate::Frame;
+
+/// Most modifiers of one periodic frame.
+pub const MAX_MODIFIERS: usize = 4;
+/// Tags from here up name frames that the device sends by itself: a periodic entry's slot, or
+/// [`TRIGGER_TAG`] plus a trigger's slot.
+pub const DEVICE_TAG: u32 = 0xFFFF_0000;
+/// See [`DEVICE_TAG`].
+pub const TRIGGER_TAG: u32 = 0xFFFF_8000;
+
+/// A frame to be sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct TxFrame {
+    /// Comes back in [`crate::Event::Transmitted`] or [`crate::Event::TransmitFailed`]. Below [`DEVICE_TAG`].
+    pub tag: u32,
+    /// The frame.
+    pub frame: Frame,
+    /// Device time, in ticks, before which it is not sent. The queue keeps its order: a later frame
+    /// waits for an earlier one.
+    pub at_ticks: Option<u64>,
+}
+
+/// A frame that the device sends again and again.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Periodic {
+    /// The frame, before modifiers.
+    pub frame: Frame,
+    /// Ticks between two transmissions' due times. No drift: due times are multiples.
+    pub period_ticks: u32,
+    /// How many times; 0 means for ever.
+    pub count: u32,
+    /// Applied in this order before each transmission.
+    pub modifiers: Vec<Modifier, MAX_MODIFIERS>,
+}
+
+/// Changes a periodic frame's data before each transmission.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Modifier {
+    /// Counts up by one, in `bits` bits of byte `byte` from bit `low_bit` up, and wraps.
+    Counter {
+        /// Byte of the data, from 0.
+        byte: u8,
+        /// Lowest bit, 0 to 7.
+        low_bit: u8,
+        /// Width, 1 to 8 - `low_bit`.
+        bits: u8,
+    },
+    /// A checksum over all other data bytes.
+    Checksum {
+        /// Byte of the data that holds it, from 0.
+        byte: u8,
+        /// How it is computed.
+        algorithm: Checksum,
+    },
+    /// A new random value.
+    Random {
+        /// Byte of the data, from 0.
+        byte: u8,
+    },
+}
+
+/// A checksum over data bytes.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum Checksum {
+    /// Exclusive or.
+    Xor,
+    /// Sum modulo 256.
+    Sum,
+    /// CRC-8 SAE-J1850: polynomial 0x1D, initial value and final exclusive-or 0xFF.
+    Crc8J1850,
+}
+
+/// A frame that is sent when a matching one is received.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Trigger {
+    /// What starts it.
+    pub filter: Filter,
+    /// What is sent.
+    pub reply: Frame,
+    /// How many times; 0 means for ever.
+    pub count: u32,
+}

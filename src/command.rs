@@ -1,29 +1,29 @@
 //! Does what a host asks. Commands that must wait for a controller become [`Work`], which is looked
 //! after at each poll; nothing here blocks.
 
-use cantap_wire::message::{
-    ChannelConfig, DEVICE_TAG, Defaults, Filter, MAX_FILTERS, MAX_SEND, Periodic, Status, Trigger, TxFrame,
-    capability,
-};
+use cantap_wire::message::{ChannelConfig, Defaults, Filter, MAX_FILTERS, Status, capability};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 use heapless::{String, Vec};
-use serde::{Deserialize, Serialize};
 
 use crate::filters::{BANKS, Layout};
 use crate::ports::{Board, Chip, Control, FilterBanks};
-use crate::transmit::{self, PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
+use crate::transmit::{PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
-/// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each.
-pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12);
+mod sending;
+mod settings;
+
+pub use sending::send;
+use sending::{set_periodic, set_trigger};
+pub use settings::MAX_SAVED;
+use settings::{ChannelSettings, saved, store};
+
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After so long the
 /// bus is stuck, and the controller is made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Time for the answer to reach the host before the device restarts.
 const LEAVE_AFTER_TICKS: u32 = 50 * TICKS_PER_MS;
-/// Target times may be so far ahead: a day.
-const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;
 
 /// Who a device is.
 #[derive(Clone, Debug)]
@@ -32,13 +32,6 @@ pub struct Identity {
     pub board: &'static str,
     /// Serial number.
     pub serial: String<24>,
-}
-
-/// One channel's settings, applied or saved.
-#[derive(Clone, Debug, Default, Serialize, Deserialize)]
-struct ChannelSettings {
-    config: Option<ChannelConfig>,
-    filters: Vec<Filter, MAX_FILTERS>,
 }
 
 /// Something that takes more than one poll.
@@ -406,32 +399,6 @@ const fn parse(text: &str) -> u16 {
     value
 }
 
-/// What is stored for a channel: one channel's settings stand behind the other's.
-///
-/// As the others that must not be inlined: each keeps bytes on the stack that the next does not need any more.
-#[inline(never)]
-fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Option<Defaults> {
-    let mut bytes = [0; MAX_SAVED];
-    let len = board.chip().load(&mut bytes);
-    let mut rest = bytes.get(..len)?;
-    for at in Channel::ALL {
-        let (ChannelSettings { config, filters }, behind) = postcard::take_from_bytes(rest).ok()?;
-        if at == channel {
-            return Some(Defaults { config: config?, filters });
-        }
-        rest = behind;
-    }
-    None
-}
-
-/// Writing flash stops the processor for up to two seconds, so no channel may be open.
-fn store<'q, const N: usize>(bytes: &[u8], board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
-    if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
-        return Err(Refusal::ChannelOpen);
-    }
-    if board.chip().save(bytes) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }
-}
-
 fn is_open<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> bool {
     board.with_capture(|capture, _, _| capture.config(channel).is_some())
 }
@@ -443,81 +410,4 @@ fn stopped<'q, const N: usize>(channel: Channel, waited: u32, board: &mut impl B
         control.halt();
     }
     control.is_stopped()
-}
-
-/// Checks that a channel can send.
-fn can_send<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Result<(), Refusal> {
-    let config = board.with_capture(|capture, _, _| capture.config(channel).copied());
-    let config = config.ok_or(Refusal::ChannelClosed)?;
-    if config.mode.transmits() { Ok(()) } else { Err(Refusal::ListenOnly) }
-}
-
-/// Queues frames, all or none, and returns how many places are free after it.
-pub fn send<'q, const N: usize>(
-    channel: Channel,
-    frames: &Vec<TxFrame, MAX_SEND>,
-    board: &mut impl Board<'q, N>,
-) -> Result<u16, Refusal> {
-    can_send(channel, board)?;
-    if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
-        return Err(Refusal::BadTag);
-    }
-    let now = board.with_capture(|capture, _, clock| capture.now(clock));
-    if frames.iter().any(|frame| frame.at_ticks.is_some_and(|at| at > now + MAX_AHEAD_TICKS)) {
-        return Err(Refusal::TooFarAhead);
-    }
-    let free = board.with_capture(|capture, _, _| capture.transmitter(channel).free());
-    if free < frames.len() {
-        return Err(Refusal::QueueFull { free: free as u16 });
-    }
-    for frame in frames {
-        board.with_capture(|capture, _, _| capture.transmitter(channel).enqueue(frame));
-    }
-    let free = board.with_capture(|capture, traffic, clock| {
-        capture.kick(channel, &mut traffic[channel.index()], clock);
-        capture.transmitter(channel).free()
-    });
-    Ok(free as u16)
-}
-
-fn set_periodic<'q, const N: usize>(
-    channel: Channel,
-    slot: u8,
-    entry: Option<Periodic>,
-    board: &mut impl Board<'q, N>,
-) -> Result<Reply, Refusal> {
-    if slot as usize >= PERIODIC_SLOTS {
-        return Err(Refusal::BadSlot);
-    }
-    if let Some(entry) = &entry {
-        can_send(channel, board)?;
-        if !transmit::is_valid(entry) {
-            return Err(Refusal::BadEntry);
-        }
-    }
-    board.with_capture(|capture, traffic, clock| {
-        let now = capture.now(clock);
-        capture.transmitter(channel).set_periodic(slot as usize, entry, now);
-        capture.kick(channel, &mut traffic[channel.index()], clock);
-    });
-    Ok(Reply::Done)
-}
-
-fn set_trigger<'q, const N: usize>(
-    channel: Channel,
-    slot: u8,
-    entry: Option<Trigger>,
-    board: &mut impl Board<'q, N>,
-) -> Result<Reply, Refusal> {
-    if slot as usize >= TRIGGER_SLOTS {
-        return Err(Refusal::BadSlot);
-    }
-    if let Some(entry) = &entry {
-        can_send(channel, board)?;
-        if !entry.filter.is_valid() {
-            return Err(Refusal::BadId);
-        }
-    }
-    board.with_capture(|capture, _, _| capture.transmitter(channel).set_trigger(slot as usize, entry));
-    Ok(Reply::Done)
 }

@@ -7,13 +7,13 @@ use crate::Channel;
 use crate::frame::{Packed, take_packed};
 use crate::varint::{take_u32, take_u64};
 
-/// The index of [`Command::Send`], as the pinned bytes have it.
+/// The index of [`super::Command::Send`], as the pinned bytes have it.
 const SEND: u32 = 6;
 
-/// Reads a request that is a [`Command::Send`] into `frames`, which is empty, and returns its id and channel. `None` if it is
+/// Reads a request that is a [`super::Command::Send`] into `frames`, which is empty, and returns its id and channel. `None` if it is
 /// another or cannot be read; what is in `frames` then means nothing.
 ///
-/// It is what a streaming host sends thousands of times a second: as a [`Request`] it would be moved about with room for the
+/// It is what a streaming host sends thousands of times a second: as a [`super::Request`] it would be moved about with room for the
 /// longest command.
 pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<(u16, Channel)> {
     let ((id, command), rest) = postcard::take_from_bytes::<(u16, u32)>(request).ok()?;
@@ -35,8 +35,8 @@ pub fn read_send(request: &[u8], frames: &mut Vec<TxFrame, MAX_SEND>) -> Option<
     Some((id, channel))
 }
 
-/// Writes a [`DeviceMessage::Response`] to `out` and returns its length, `None` if there is no room. The answer stays where
-/// it is: a [`Response`] that is moved about has room for the longest.
+/// Writes a [`super::DeviceMessage::Response`] to `out` and returns its length, `None` if there is no room. The answer stays where
+/// it is: a [`super::Response`] that is moved about has room for the longest.
 pub fn write_response(id: u16, result: &Result<Reply, Refusal>, out: &mut [u8]) -> Option<usize> {
     /// The variant's index, as the pinned bytes have it.
     const RESPONSE: u32 = 1;

@@ -24,7 +24,7 @@ impl Mode {
     }
 }
 
-/// What [`Command::Open`] applies.
+/// What [`super::Command::Open`] applies.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct ChannelConfig {
     /// Bit timing.
@@ -33,7 +33,7 @@ pub struct ChannelConfig {
     pub mode: Mode,
     /// No automatic retransmission.
     pub one_shot: bool,
-    /// Leave bus-off only by [`Command::Recover`].
+    /// Leave bus-off only by [`super::Command::Recover`].
     pub manual_recovery: bool,
     /// Leave received frames' data bytes out of the stream.
     pub omit_data: bool,

@@ -73,7 +73,7 @@ pub struct RegisterSet {
     pub btr: u32,
 }
 
-/// To [`Command::Registers`].
+/// To [`super::Command::Registers`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct Registers {
     /// When the request was handled.

@@ -1,0 +1,89 @@
+//! What a host asks to be sent: once, again and again, in reply.
+
+use cantap_wire::message::{DEVICE_TAG, MAX_SEND, Periodic, Trigger, TxFrame};
+use cantap_wire::{Channel, Refusal, Reply};
+use heapless::Vec;
+
+use crate::TICK_HZ;
+use crate::ports::Board;
+use crate::transmit::{self, PERIODIC_SLOTS, TRIGGER_SLOTS};
+
+/// Target times may be so far ahead: a day.
+const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;
+
+/// Checks that a channel can send.
+fn can_send<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Result<(), Refusal> {
+    let config = board.with_capture(|capture, _, _| capture.config(channel).copied());
+    let config = config.ok_or(Refusal::ChannelClosed)?;
+    if config.mode.transmits() { Ok(()) } else { Err(Refusal::ListenOnly) }
+}
+
+/// Queues frames, all or none, and returns how many places are free after it.
+pub fn send<'q, const N: usize>(
+    channel: Channel,
+    frames: &Vec<TxFrame, MAX_SEND>,
+    board: &mut impl Board<'q, N>,
+) -> Result<u16, Refusal> {
+    can_send(channel, board)?;
+    if frames.iter().any(|frame| frame.tag >= DEVICE_TAG) {
+        return Err(Refusal::BadTag);
+    }
+    let now = board.with_capture(|capture, _, clock| capture.now(clock));
+    if frames.iter().any(|frame| frame.at_ticks.is_some_and(|at| at > now + MAX_AHEAD_TICKS)) {
+        return Err(Refusal::TooFarAhead);
+    }
+    let free = board.with_capture(|capture, _, _| capture.transmitter(channel).free());
+    if free < frames.len() {
+        return Err(Refusal::QueueFull { free: free as u16 });
+    }
+    for frame in frames {
+        board.with_capture(|capture, _, _| capture.transmitter(channel).enqueue(frame));
+    }
+    let free = board.with_capture(|capture, traffic, clock| {
+        capture.kick(channel, &mut traffic[channel.index()], clock);
+        capture.transmitter(channel).free()
+    });
+    Ok(free as u16)
+}
+
+pub(super) fn set_periodic<'q, const N: usize>(
+    channel: Channel,
+    slot: u8,
+    entry: Option<Periodic>,
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    if slot as usize >= PERIODIC_SLOTS {
+        return Err(Refusal::BadSlot);
+    }
+    if let Some(entry) = &entry {
+        can_send(channel, board)?;
+        if !transmit::is_valid(entry) {
+            return Err(Refusal::BadEntry);
+        }
+    }
+    board.with_capture(|capture, traffic, clock| {
+        let now = capture.now(clock);
+        capture.transmitter(channel).set_periodic(slot as usize, entry, now);
+        capture.kick(channel, &mut traffic[channel.index()], clock);
+    });
+    Ok(Reply::Done)
+}
+
+pub(super) fn set_trigger<'q, const N: usize>(
+    channel: Channel,
+    slot: u8,
+    entry: Option<Trigger>,
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    if slot as usize >= TRIGGER_SLOTS {
+        return Err(Refusal::BadSlot);
+    }
+    if let Some(entry) = &entry {
+        can_send(channel, board)?;
+        if !entry.filter.is_valid() {
+            return Err(Refusal::BadId);
+        }
+    }
+    board.with_capture(|capture, _, _| capture.transmitter(channel).set_trigger(slot as usize, entry));
+    Ok(Reply::Done)
+}

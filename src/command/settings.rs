@@ -1,0 +1,48 @@
+//! Channels' settings, in a session and over a power cycle.
+
+use cantap_wire::message::{ChannelConfig, Defaults, Filter, MAX_FILTERS};
+use cantap_wire::{CHANNELS, Channel, Refusal, Reply};
+use heapless::Vec;
+use serde::{Deserialize, Serialize};
+
+use super::is_open;
+use crate::ports::{Board, Chip};
+
+/// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each.
+pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12);
+
+/// One channel's settings, applied or saved.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub(super) struct ChannelSettings {
+    pub(super) config: Option<ChannelConfig>,
+    pub(super) filters: Vec<Filter, MAX_FILTERS>,
+}
+
+/// What is stored for a channel: one channel's settings stand behind the other's.
+///
+/// As the others that must not be inlined: each keeps bytes on the stack that the next does not need any more.
+#[inline(never)]
+pub(super) fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> Option<Defaults> {
+    let mut bytes = [0; MAX_SAVED];
+    let len = board.chip().load(&mut bytes);
+    let mut rest = bytes.get(..len)?;
+    for at in Channel::ALL {
+        let (ChannelSettings { config, filters }, behind) = postcard::take_from_bytes(rest).ok()?;
+        if at == channel {
+            return Some(Defaults { config: config?, filters });
+        }
+        rest = behind;
+    }
+    None
+}
+
+/// Writing flash stops the processor for up to two seconds, so no channel may be open.
+pub(super) fn store<'q, const N: usize>(
+    bytes: &[u8],
+    board: &mut impl Board<'q, N>,
+) -> Result<Reply, Refusal> {
+    if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
+        return Err(Refusal::ChannelOpen);
+    }
+    if board.chip().save(bytes) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }
+}

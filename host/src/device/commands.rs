@@ -1,0 +1,123 @@
+//! What a device can be asked, one method each.
+
+use cantap_wire::message::{ChannelConfig, Defaults, Filter, Periodic, Registers, Status, Trigger, TxFrame};
+use cantap_wire::{Channel, Command, Refusal, Reply};
+
+use super::{Device, DeviceError};
+
+impl Device {
+    /// The state of the device.
+    pub fn status(&self) -> Result<Status, DeviceError> {
+        match self.request(Command::Status)? {
+            Reply::Status(status) => Ok(status),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// The device's time, in ticks since it started.
+    pub fn time(&self) -> Result<u64, DeviceError> {
+        match self.request(Command::Time)? {
+            Reply::Time(ticks) => Ok(ticks),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Replaces all filters of a closed channel. Returns the hardware banks that it uses and could use.
+    pub fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<(u8, u8), DeviceError> {
+        let filters = heapless::Vec::from_slice(filters).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::SetFilters { channel, filters })? {
+            Reply::Filters { banks_used, banks_total } => Ok((banks_used, banks_total)),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Queues frames for transmission, all or none. Returns the places that are free after it.
+    pub fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<u16, DeviceError> {
+        let frames = heapless::Vec::from_slice(frames).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::Send { channel, frames })? {
+            Reply::Queued { free } => Ok(free),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Drops everything that is queued for transmission.
+    pub fn abort(&self, channel: Channel) -> Result<(), DeviceError> {
+        self.done(Command::Abort { channel })
+    }
+
+    /// Sets or clears a periodic transmission.
+    pub fn set_periodic(
+        &self,
+        channel: Channel,
+        slot: u8,
+        entry: Option<Periodic>,
+    ) -> Result<(), DeviceError> {
+        self.done(Command::SetPeriodic { channel, slot, entry })
+    }
+
+    /// Sets or clears a reply that is sent when a matching frame is received.
+    pub fn set_trigger(&self, channel: Channel, slot: u8, entry: Option<Trigger>) -> Result<(), DeviceError> {
+        self.done(Command::SetTrigger { channel, slot, entry })
+    }
+
+    /// The controller's registers.
+    pub fn registers(&self, channel: Channel) -> Result<Registers, DeviceError> {
+        match self.request(Command::Registers { channel })? {
+            Reply::Registers(registers) => Ok(registers),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Leaves bus-off where recovery is manual.
+    pub fn recover(&self, channel: Channel) -> Result<(), DeviceError> {
+        self.done(Command::Recover { channel })
+    }
+
+    /// Shows an LED pattern, to find the device among others.
+    pub fn identify(&self, seconds: u8) -> Result<(), DeviceError> {
+        self.done(Command::Identify { seconds })
+    }
+
+    /// Restarts the firmware. The port vanishes.
+    pub fn reset(&self) -> Result<(), DeviceError> {
+        self.done(Command::Reset)
+    }
+
+    /// Enters the chip's USB bootloader. The port vanishes.
+    pub fn bootloader(&self) -> Result<(), DeviceError> {
+        self.done(Command::Bootloader)
+    }
+
+    /// Gives a closed channel the configuration that [`Self::save_defaults`] stores, without opening it.
+    pub fn configure(&self, channel: Channel, config: ChannelConfig) -> Result<(), DeviceError> {
+        self.done(Command::Configure { channel, config })
+    }
+
+    /// What is stored on the device for a channel, if anything is. Nothing is opened.
+    pub fn defaults(&self, channel: Channel) -> Result<Option<Defaults>, DeviceError> {
+        match self.request(Command::Defaults { channel }) {
+            Ok(Reply::Defaults(defaults)) => Ok(Some(defaults)),
+            Err(DeviceError::Refused { refusal: Refusal::NothingSaved }) => Ok(None),
+            Ok(_) => Err(DeviceError::WrongReply),
+            Err(error) => Err(error),
+        }
+    }
+
+    /// Stores the filters and configuration that each channel has in this session on the device; a channel that has none
+    /// keeps what is stored.
+    pub fn save_defaults(&self) -> Result<(), DeviceError> {
+        self.done(Command::SaveDefaults)
+    }
+
+    /// Erases what [`Self::save_defaults`] stored.
+    pub fn clear_defaults(&self) -> Result<(), DeviceError> {
+        self.done(Command::ClearDefaults)
+    }
+
+    pub(super) fn done(&self, command: Command) -> Result<(), DeviceError> {
+        match self.request(command)? {
+            Reply::Done => Ok(()),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+}

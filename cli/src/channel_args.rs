@@ -31,10 +31,10 @@ pub struct ChannelArgs {
     /// command runs; or after a time, such as 100ms.
     #[arg(long, value_name = "auto|manual|TIME", value_parser = recovery)]
     recovery: Option<RecoveryArg>,
-    /// Leave data bytes out of the stream, to save bandwidth.
+    /// Leave data bytes out of the stream, to save bandwidth: files have zeros in their place.
     #[arg(long)]
     no_data: bool,
-    /// Leave time stamps out of the stream, to save bandwidth.
+    /// Leave time stamps out of the stream, to save bandwidth: times are only upper bounds.
     #[arg(long)]
     no_stamps: bool,
 }
@@ -80,6 +80,15 @@ struct Plan {
 }
 
 impl ChannelArgs {
+    /// Whether anything was asked for.
+    pub fn is_given(&self) -> bool {
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps } = self;
+        timing.is_given_or_wished()
+            || mode.is_some()
+            || recovery.is_some()
+            || [one_shot, no_data, no_stamps].into_iter().any(|flag| *flag)
+    }
+
     /// The mode that was asked for, if one was.
     pub fn mode(&self) -> Option<Mode> {
         Some(match self.mode? {
@@ -217,6 +226,16 @@ impl ChannelArgs {
             ..base
         };
         Ok(Plan { channel, config, saved })
+    }
+}
+
+/// The mode as `--mode` takes it.
+pub const fn mode_name(mode: Mode) -> &'static str {
+    match mode {
+        Mode::ListenOnly => "listen",
+        Mode::Normal => "normal",
+        Mode::Loopback => "loopback",
+        Mode::SilentLoopback => "silent-loopback",
     }
 }
 

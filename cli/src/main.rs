@@ -31,6 +31,7 @@ mod rescue;
 mod sending;
 mod timing_args;
 mod trigger_args;
+mod wrong;
 
 use std::process::ExitCode;
 
@@ -82,9 +83,12 @@ fn sentence(error: &anyhow::Error) -> String {
     })
 }
 
-/// A condition is a part of the command line, though it is understood only when the databases have been read.
+/// What belongs to the command line and is understood only later: a condition when the databases have been read, a device's
+/// options when it is opened.
 fn is_wrong_command_line(error: &anyhow::Error) -> bool {
-    error.is::<cantap::condition::ConditionError>()
+    error.is::<wrong::WrongCommandLine>()
+        || error.is::<cantap::condition::ConditionError>()
+        || matches!(error.downcast_ref(), Some(cantap::DeviceError::BadAddress { .. }))
 }
 
 /// Whether it only says that nobody reads our output any more.

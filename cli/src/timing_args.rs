@@ -1,11 +1,11 @@
 //! How a user gives a bit timing; the same options in every command that opens a channel.
 
-use anyhow::bail;
 use cantap::Channel;
 use cantap::bit_timing::{self, TimingError, TimingRequest};
 use cantap::wire::BitTiming;
 
 use crate::channel_bitrate::ChannelBitrate;
+use crate::wrong::wrong;
 
 /// A bit timing on the command line; for commands to flatten into theirs.
 #[derive(clap::Args, Clone, Debug, Default)]
@@ -52,6 +52,12 @@ impl TimingArgs {
         !self.bitrates.is_empty() || self.segments.is_some() || self.btr.is_some()
     }
 
+    /// Whether anything was asked for, be it only how a timing should be.
+    pub fn is_given_or_wished(&self) -> bool {
+        let Wishes { sample_point, sjw, triple } = &self.wishes;
+        self.is_given() || sample_point.is_some() || sjw.is_some() || *triple
+    }
+
     /// Asks for these bit rates in place of any other timing.
     pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
         (self.segments, self.btr) = (None, None);
@@ -61,6 +67,14 @@ impl TimingArgs {
     /// What was asked for on a channel, if anything was.
     pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
+        let is_there = |number| Channel::ALL.iter().any(|channel| channel.number() == number);
+        if let Some(number) =
+            self.bitrates.iter().filter_map(|rate| rate.channel).find(|number| !is_there(*number))
+        {
+            return Err(wrong(format!(
+                "a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k"
+            )));
+        }
         if let Some(timing) = self.segments.or(self.btr) {
             return Ok(Some(TimingRequest::Exact(timing)));
         }
@@ -70,7 +84,7 @@ impl TimingArgs {
                 Ok(Some(TimingRequest::Rate { bitrate_bps, sample_point_percent: sample_point, sjw }))
             }
             None if sample_point.is_some() || sjw.is_some() => {
-                bail!("a sample point or jump width needs a bit rate; add -b RATE")
+                Err(wrong("a sample point or jump width needs a bit rate; add -b RATE"))
             }
             None => Ok(None),
         }
@@ -149,6 +163,7 @@ mod tests {
             "--btr +1",
             "--btr 0x80000000",
             "-b 251000",
+            "-b 500k -b 3:250k",
         ] {
             assert!(timing(line).is_err(), "{line}");
         }

@@ -98,6 +98,12 @@ fn status_has_the_documented_keys() {
     );
     let channel = &object["channels"][1];
     assert_eq!((&channel["channel"], &channel["state"]), (&2.into(), &"active".into()));
+    assert_eq!(
+        keys(channel),
+        "bitrate_bps bus_errors channel frames last_error lost_controller lost_queue mode open rec registers \
+         registers_at_last_error state tec transmit_failures transmitted tx_pending"
+    );
+    assert!(channel["mode"].is_null() && channel["bitrate_bps"].is_null(), "{out}");
     assert_eq!(keys(&channel["registers"]), "btr esr ier mcr msr rf0r tsr");
     assert!(channel["registers_at_last_error"].is_null());
 }
@@ -115,6 +121,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
         );
         assert!(channel["frames"].as_u64() > Some(50) && channel["bus_errors"].as_u64() > Some(20), "{out}");
         assert!(channel["last_error"].is_string(), "{out}");
+        assert_eq!((&channel["mode"], &channel["bitrate_bps"]), (&"listen".into(), &500_000.into()));
     }
     // In normal mode its counters count, and the registers at the last error are known.
     let line =
@@ -122,7 +129,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
     let (code, out, err) = cantap(line);
     assert_eq!(code, Some(0), "{err}");
     assert!(
-        out.contains("channel 1    open, Normal, 500000 bit/s") && out.contains("channel 2    closed"),
+        out.contains("channel 1    open, normal, 500000 bit/s") && out.contains("channel 2    closed"),
         "{out}"
     );
     // A frame in twenty is good, and takes it back from passive for a moment.
@@ -131,8 +138,12 @@ fn status_tells_of_a_bus_that_it_listened_to() {
     let registers = out.split("registers of channel 1").nth(1).unwrap();
     let esr = registers.lines().find(|line| line.contains("CAN_ESR")).unwrap();
     assert!(!esr.trim_end().ends_with('-'), "{out}");
-    let (code, _, err) = cantap("status -d virtual -b 500k");
-    assert!(code == Some(1) && err.contains("add --time"), "{err}");
+    for without_time in
+        ["-b 500k", "--mode normal", "--one-shot", "--recovery manual", "--no-data", "--sjw 1"]
+    {
+        let (code, out, err) = cantap(&format!("status -d virtual {without_time}"));
+        assert!((code, out.as_str()) == (Some(2), "") && err.contains("add --time"), "{without_time}: {err}");
+    }
 }
 
 #[test]

@@ -20,7 +20,8 @@ pub enum Remainder {
     Nothing,
     /// More than a request holds.
     #[error(
-        "there are more filters than the device takes ({MAX_FILTERS}), so the computer does the filtering"
+        "there are more filters than the device takes ({MAX_FILTERS}; each counts twice, for standard and for extended \
+         frames, unless its mask names one kind, as 123:C00007FF does), so the computer does the filtering"
     )]
     TooMany,
     /// More than the hardware holds.
@@ -177,6 +178,14 @@ mod tests {
         assert_eq!(compiled("can0,100:C00007FF,200:C00007FF,j").remainder, Some(Remainder::Nothing));
         let many: Vec<String> = (0..60).map(|id| format!("{id:03X}:C00007FF")).collect();
         assert_eq!(compiled(&many.join(",")).remainder, Some(Remainder::TooMany));
+        // Half as many are too many where they do not name their format, and the sentence says why.
+        let both_kinds = |count| {
+            let ids: Vec<String> = (0..count).map(|id| format!("{id:03X}:7FF")).collect();
+            compiled(&ids.join(","))
+        };
+        assert_eq!((both_kinds(28).hardware.len(), both_kinds(28).remainder), (56, None));
+        let sentence = both_kinds(29).remainder.unwrap().to_string();
+        assert!(sentence.contains("(56; each counts twice"), "{sentence}");
         assert_eq!(compiled("can0"), Compiled::everything(None));
         assert_eq!(compiled("can0,#1FF"), Compiled::everything(None));
     }

@@ -4,12 +4,12 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use cantap::filter::Filter;
-use cantap::wire::message::{Defaults, FrameKind, Mode};
+use cantap::wire::message::{Defaults, FrameKind};
 use cantap::{Address, Channel, Device};
 use serde_json::{Value, json};
 
 use crate::args;
-use crate::channel_args::ChannelArgs;
+use crate::channel_args::{ChannelArgs, mode_name};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -98,16 +98,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
     }
     Ok(ExitCode::SUCCESS)
-}
-
-/// The mode as `--mode` takes it.
-const fn mode_name(mode: Mode) -> &'static str {
-    match mode {
-        Mode::ListenOnly => "listen",
-        Mode::Normal => "normal",
-        Mode::Loopback => "loopback",
-        Mode::SilentLoopback => "silent-loopback",
-    }
 }
 
 /// The options that are set, as the command line names them.

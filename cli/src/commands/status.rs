@@ -4,20 +4,21 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
-use cantap::wire::message::{ChannelStatus, Mode, RegisterSet, Status};
+use cantap::wire::message::{ChannelStatus, Hello, Mode, RegisterSet, Status};
 use cantap::wire::record::{BusErrorKind, ErrorState};
 use cantap::{Address, Channel, Device};
 use serde_json::{Value, json};
 
-use crate::channel_args::ChannelArgs;
+use crate::channel_args::{ChannelArgs, mode_name};
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
     after_help = "Connecting begins a session: it closes both channels and sets the counters to zero. So to learn something of a \
-                        bus, listen to it for a while first, with --time.\n\n\
+                        bus, listen to it for a while first, with --time.\nWith --json, mode and bitrate_bps of a channel are null \
+                        while it is closed; modes have the names that --mode takes.\n\n\
                         Examples:\n  cantap status -d /dev/ttyACM0\n  cantap status -d /dev/ttyACM0 -b 500k --time 2s\n  \
                         cantap status -d virtual --registers --json"
 )]
@@ -46,6 +47,11 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.time.is_none() && args.open.is_given() {
+        return Err(wrong(
+            "without --time no channel is opened, so how to open it says nothing; add --time to listen for so long before asking",
+        ));
+    }
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     if let Some(time) = args.time {
@@ -56,8 +62,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             std::thread::sleep(LOOK_EVERY.min(ends.saturating_duration_since(Instant::now())));
             rescue.look()?;
         }
-    } else if args.open.timing.is_given() {
-        bail!("a bit rate alone opens nothing; add --time to listen for so long before asking");
     }
     let status = device.status()?;
     let mut registers = Vec::new();
@@ -69,7 +73,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     let uptime_s = status.ticks as f64 / f64::from(device.hello().tick_hz);
     if args.json {
-        let mut object = object(&status, uptime_s, device.hello().queue_bytes);
+        let mut object = object(&status, uptime_s, device.hello());
         for (channel, registers) in object["channels"].as_array_mut().into_iter().flatten().zip(&registers) {
             channel["registers"] = register_object(&registers.now);
             channel["registers_at_last_error"] =
@@ -95,7 +99,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
         let open = state.open.map_or("closed".to_owned(), |config| {
             let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
-            format!("open, {:?}, {bitrate} bit/s", config.mode)
+            format!("open, {}, {bitrate} bit/s", mode_name(config.mode))
         });
         writeln!(out, "\nchannel {}    {open}", channel.number())?;
         writeln!(out, "  state      {}, TEC {}, REC {}", name(state.state), state.tec, state.rec)?;
@@ -124,28 +128,30 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn object(status: &Status, uptime_s: f64, queue_size_bytes: u32) -> Value {
+fn object(status: &Status, uptime_s: f64, hello: &Hello) -> Value {
     let channels: Vec<Value> = Channel::ALL
         .into_iter()
         .zip(&status.channels)
-        .map(|(channel, state)| channel_object(channel, state))
+        .map(|(channel, state)| channel_object(channel, state, hello.can_clock_hz))
         .collect();
     json!({
         "uptime_s": uptime_s,
         "temperature_celsius": status.temperature_decicelsius.map(|value| f64::from(value) / 10.0),
         "supply_volts": status.supply_millivolts.map(|value| f64::from(value) / 1e3),
         "queue_bytes": status.queue_bytes,
-        "queue_size_bytes": queue_size_bytes,
+        "queue_size_bytes": hello.queue_bytes,
         "queue_high_water_bytes": status.queue_high_water_bytes,
         "bad_requests": status.bad_requests,
         "channels": channels,
     })
 }
 
-fn channel_object(channel: Channel, state: &ChannelStatus) -> Value {
+fn channel_object(channel: Channel, state: &ChannelStatus, can_clock_hz: u32) -> Value {
     json!({
         "channel": channel.number(),
         "open": state.open.is_some(),
+        "mode": state.open.map(|config| mode_name(config.mode)),
+        "bitrate_bps": state.open.map(|config| config.timing.bitrate_bps(can_clock_hz)),
         "state": name(state.state),
         "tec": state.tec,
         "rec": state.rec,

@@ -17,6 +17,14 @@ pub enum DeviceError {
         /// What is wrong with it and what would be right.
         reason: String,
     },
+    /// The emulated board does not come up.
+    #[error("the emulated board at '{address}' does not start: {reason}")]
+    Emulation {
+        /// As it was given.
+        address: String,
+        /// What the emulator says.
+        reason: String,
+    },
     /// There is nothing at the address.
     #[error("there is no device at '{address}'; `cantap list` shows what is connected")]
     NotFound {
@@ -136,6 +144,12 @@ pub(crate) fn no_timing(bitrate_bps: u32, reason: &NoTiming) -> String {
         ),
         NoTiming::Unreachable { below_bps, above_bps } => {
             let nearest: Vec<String> = [below_bps, above_bps].iter().flatten().map(u32::to_string).collect();
+            if nearest.is_empty() {
+                return format!(
+                    "the clock cannot be divided to {bitrate_bps} bit/s, nor to any other rate from {MIN_BITRATE_BPS} to \
+                     {MAX_BITRATE_BPS}; a CAN controller's clock has some MHz"
+                );
+            }
             format!(
                 "the device's clock cannot be divided to {bitrate_bps} bit/s; the nearest it reaches: {} bit/s",
                 nearest.join(" and ")

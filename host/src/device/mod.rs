@@ -360,12 +360,11 @@ fn connect(address: &Address) -> Result<Link, DeviceError> {
 
 #[cfg(feature = "emu")]
 fn emulated(file: &str, address: &Address) -> Result<Link, DeviceError> {
-    let bad = |error: cantap_sim::address::AddressError| DeviceError::BadAddress {
-        address: address.to_string(),
-        reason: error.to_string(),
-    };
-    let parsed: cantap_sim::address::Address = file.parse().map_err(bad)?;
-    let port = parsed.open().map_err(bad)?;
+    let (name, parsed) = (address.to_string(), file.parse::<cantap_sim::address::Address>());
+    let parsed = parsed
+        .map_err(|error| DeviceError::BadAddress { address: name.clone(), reason: error.to_string() })?;
+    let port =
+        parsed.open().map_err(|error| DeviceError::Emulation { address: name, reason: error.to_string() })?;
     Ok(Link::new(port.reader, port.writer).keeping(port.device))
 }
 

@@ -1,0 +1,20 @@
+//! What is wrong with a command line and cannot be seen by looking at one option alone.
+
+use std::fmt;
+
+/// Ends a command with the exit code for a wrong command line. Its text says what would be right.
+#[derive(Debug)]
+pub struct WrongCommandLine(pub String);
+
+impl fmt::Display for WrongCommandLine {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::error::Error for WrongCommandLine {}
+
+/// The error that says so.
+pub fn wrong(message: impl Into<String>) -> anyhow::Error {
+    WrongCommandLine(message.into()).into()
+}

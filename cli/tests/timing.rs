@@ -54,3 +54,21 @@ fn impossible_wishes_are_one_line_that_says_what_is_possible() {
     let (code, _, err) = timing(&["-b", "fast"]);
     assert!(code == Some(2) && err.contains("500k"), "{err}");
 }
+
+#[test]
+fn a_clock_that_reaches_nothing_is_told_in_a_sentence() {
+    for clock in ["1", "100"] {
+        let (code, out, err) = timing(&["-b", "500k", "--clock", clock]);
+        assert_eq!((code, out.as_str()), (Some(1), ""));
+        assert_eq!(
+            err,
+            "cantap: the clock cannot be divided to 500000 bit/s, nor to any other rate from 5000 to 1000000; a CAN \
+             controller's clock has some MHz\n"
+        );
+    }
+    for clock in ["0", "4294967295", "fast"] {
+        let (code, _, err) = timing(&["-b", "500k", "--clock", clock]);
+        assert!(code == Some(2) && err.contains("write the clock of the CAN controller in Hz"), "{err}");
+    }
+    assert_eq!(timing(&["-b", "500k", "--clock", "1000M"]).0, Some(0));
+}

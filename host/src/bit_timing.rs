@@ -45,8 +45,9 @@ pub enum TimingError {
     },
     /// Segments outside the controller's registers.
     #[error(
-        "segments {0:?} are outside the controller's ranges: prescaler 1 to 1024, segment 1 (PROP+PS1) 1 to 16, \
-         segment 2 (PS2) 1 to 8, jump width 1 to 4 and not above segment 2"
+        "{} is out of range; the controller takes a prescaler of 1 to 1024, a segment 1 (PROP+PS1) of 1 to 16 quanta, \
+         a segment 2 (PS2) of 1 to 8, and a jump width of 1 to 4 that is not above segment 2",
+        out_of_range(*.0)
     )]
     Segments(BitTiming),
     /// Segments that make an impossible bit rate.
@@ -69,6 +70,19 @@ pub enum TimingError {
         "this controller (bxCAN) samples each bit once; triple sampling does not exist in it: leave --triple away"
     )]
     TripleSampling,
+}
+
+/// Which part of a timing makes it invalid.
+fn out_of_range(timing: BitTiming) -> &'static str {
+    if !(1..=1024).contains(&timing.prescaler) {
+        "the prescaler"
+    } else if !(1..=16).contains(&timing.segment1) {
+        "segment 1 (PROP+PS1)"
+    } else if !(1..=8).contains(&timing.segment2) {
+        "segment 2 (PS2)"
+    } else {
+        "the jump width"
+    }
 }
 
 /// How a user gives a bit timing.
@@ -318,6 +332,19 @@ mod tests {
         }
         for text in ["0,13,2,2", "1025,13,2,2", "9,17,2,2", "9,13,9,2", "9,13,2,3", "9,269,2,2"] {
             assert!(matches!(parse_segments(text), Err(TimingError::Segments(_))), "{text}");
+        }
+        for (text, part) in [
+            ("0,13,2,2", "the prescaler"),
+            ("9,300,2,2", "segment 1 (PROP+PS1)"),
+            ("9,13,9,2", "segment 2 (PS2)"),
+            ("9,6,1,2", "the jump width"),
+        ] {
+            let message = parse_segments(text).unwrap_err().to_string();
+            assert!(
+                message.starts_with(&format!("{part} is out of range; the controller takes")),
+                "{message}"
+            );
+            assert!(!message.contains('{'), "{message}");
         }
         let too_fast = TimingRequest::Exact(BitTiming { prescaler: 1, ..timing });
         assert_eq!(too_fast.resolve(CLOCK), Err(TimingError::Rate(2_250_000)));

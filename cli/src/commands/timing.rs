@@ -21,13 +21,23 @@ pub struct Args {
     #[arg(short, long, value_name = "RATE", value_parser = args::bitrate)]
     bitrate: u32,
     /// Clock of the CAN controller in Hz: 36000000, 36M. cantap's boards have 36 MHz.
-    #[arg(long, value_name = "HZ", default_value = "36M", value_parser = args::bitrate)]
+    #[arg(long, value_name = "HZ", default_value = "36M", value_parser = clock)]
     clock: u32,
     #[command(flatten)]
     wishes: Wishes,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+}
+
+/// No CAN controller's clock is faster.
+const MAX_CLOCK_HZ: u32 = 1_000_000_000;
+
+fn clock(text: &str) -> Result<u32, String> {
+    let clock = args::bitrate(text).ok().filter(|clock| *clock <= MAX_CLOCK_HZ);
+    clock.ok_or_else(|| {
+        "write the clock of the CAN controller in Hz, such as 36000000 or 36M, up to 1000M".to_owned()
+    })
 }
 
 /// Runs it.

@@ -1,20 +1,43 @@
 //! What a capture's summary says of a channel.
 
 use cantap::stats::WorkLoad;
+use cantap::wire::message::ChannelConfig;
 use cantap::{TraceEvent, TraceRecord, bits_on_bus};
 
 /// Counts one channel's frames as they are delivered.
 pub struct Meter {
     frames: u64,
     lost: u64,
+    bus_errors: u64,
     span_ns: Option<(i64, i64)>,
     load: WorkLoad,
+    omits_data: bool,
+    omits_stamps: bool,
+    without_data: u64,
 }
 
 impl Meter {
-    /// Nothing delivered yet.
+    /// Nothing delivered yet, of a channel that streams everything.
     pub fn new(bitrate_bps: u32) -> Self {
-        Self { frames: 0, lost: 0, span_ns: None, load: WorkLoad::new(bitrate_bps) }
+        Self {
+            frames: 0,
+            lost: 0,
+            bus_errors: 0,
+            span_ns: None,
+            load: WorkLoad::new(bitrate_bps),
+            omits_data: false,
+            omits_stamps: false,
+            without_data: 0,
+        }
+    }
+
+    /// Nothing delivered yet, of a channel opened this way.
+    pub fn of(config: &ChannelConfig, can_clock_hz: u32) -> Self {
+        Self {
+            omits_data: config.omit_data,
+            omits_stamps: config.omit_stamps,
+            ..Self::new(config.timing.bitrate_bps(can_clock_hz))
+        }
     }
 
     /// Takes the channel's next record.
@@ -24,13 +47,16 @@ impl Meter {
                 self.frames += 1;
                 let first = self.span_ns.map_or(record.time_ns, |(first, _)| first);
                 self.span_ns = Some((first, record.time_ns));
+                self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
                 self.load.frame(record.time_ns, bits_on_bus(frame));
             }
             TraceEvent::Lost { count, .. } => {
                 self.lost += u64::from(*count);
                 self.load.gap();
             }
-            _ => {}
+            TraceEvent::BusError { .. } => self.bus_errors += 1,
+            TraceEvent::ErrorsSuppressed { count } => self.bus_errors += u64::from(*count),
+            TraceEvent::State { .. } | TraceEvent::TransmitFailed { .. } => {}
         }
     }
 
@@ -44,20 +70,28 @@ impl Meter {
         self.lost
     }
 
+    /// Bus errors, those reported one by one and those only counted.
+    pub const fn bus_errors(&self) -> u64 {
+        self.bus_errors
+    }
+
     /// From the first frame to the last, in seconds.
     pub fn seconds(&self) -> f64 {
         self.span_ns.map_or(0.0, |(first, last)| (last - first) as f64 / 1e9)
     }
 
-    /// Delivered frames per second, between the first and the last.
-    pub fn frames_per_s(&self) -> f64 {
+    /// Delivered frames per second, between the first and the last; `None` where frames came without their times.
+    pub fn frames_per_s(&self) -> Option<f64> {
         let seconds = self.seconds();
-        if seconds > 0.0 { (self.frames - 1) as f64 / seconds } else { 0.0 }
+        let rate = if seconds > 0.0 { (self.frames - 1) as f64 / seconds } else { 0.0 };
+        (!self.omits_stamps).then_some(rate)
     }
 
-    /// Bus load in per cent, from exact lengths, over the intervals without a loss.
-    pub fn bus_load_pct(&self) -> f64 {
-        self.load.mean_pct().unwrap_or(0.0)
+    /// Bus load in per cent, from exact lengths, over the intervals without a loss; `None` where times or data, and so the
+    /// stuff bits, are not known.
+    pub fn bus_load_pct(&self) -> Option<f64> {
+        let is_known = !self.omits_stamps && self.without_data == 0;
+        is_known.then(|| self.load.mean_pct().unwrap_or(0.0))
     }
 }
 
@@ -65,4 +99,56 @@ impl Meter {
 pub fn rounded(value: f64, decimals: i32) -> f64 {
     let factor = 10_f64.powi(decimals);
     (value * factor).round() / factor
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap::Direction;
+    use cantap::wire::{BitTiming, Frame};
+
+    fn meter(change: impl FnOnce(&mut ChannelConfig), frames: &[&str]) -> Meter {
+        let timing = BitTiming::choose(36_000_000, 500_000, None).unwrap();
+        let mut config = ChannelConfig::listen_only(timing);
+        change(&mut config);
+        let mut meter = Meter::of(&config, 36_000_000);
+        for (at, text) in frames.iter().enumerate() {
+            let frame: Frame = text.parse().unwrap();
+            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            meter.push(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event });
+        }
+        meter
+    }
+
+    #[test]
+    fn errors_are_those_reported_and_those_only_counted() {
+        let mut meter = meter(|_| {}, &[]);
+        for event in [
+            TraceEvent::BusError { kind: None, counters: None },
+            TraceEvent::ErrorsSuppressed { count: 40 },
+            TraceEvent::ErrorsSuppressed { count: u32::MAX },
+        ] {
+            meter.push(&TraceRecord { time_ns: 0, channel: 1, event });
+        }
+        assert_eq!((meter.bus_errors(), meter.frames()), (41 + u64::from(u32::MAX), 0));
+    }
+
+    #[test]
+    fn no_load_is_told_where_data_is_not_known() {
+        let data = ["123#0000", "123#R", "123#"];
+        let with = meter(|_| {}, &data);
+        assert!(with.without_data == 0 && with.bus_load_pct() > Some(0.0));
+        let without = meter(|config| config.omit_data = true, &data);
+        assert_eq!((without.without_data, without.bus_load_pct()), (1, None));
+        assert_eq!(without.frames_per_s(), Some(1000.0));
+        // What has no data lacks none.
+        let without = meter(|config| config.omit_data = true, &data[1..]);
+        assert!(without.without_data == 0 && without.bus_load_pct() > Some(0.0));
+    }
+
+    #[test]
+    fn neither_rate_nor_load_is_told_where_times_are_not_known() {
+        let meter = meter(|config| config.omit_stamps = true, &["123#00", "123#00"]);
+        assert_eq!((meter.frames(), meter.frames_per_s(), meter.bus_load_pct()), (2, None, None));
+    }
 }

@@ -141,21 +141,122 @@ fn capture_with_json_prints_one_object_and_nothing_else() {
     assert!((55.0..65.0).contains(&load), "{load}");
 }
 
+/// A captured channel, and what `stats` says of it by the recorded file.
+fn captured_and_counted(options: &str, channel: usize) -> (serde_json::Value, serde_json::Value, String) {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("trace.log");
+    let (code, out, err) = cantap(&format!("capture {options} --json -o {}", file.display()));
+    assert_eq!(code, Some(0), "{err}");
+    let (code, counted, _) = cantap(&format!("stats {} --json", file.display()));
+    assert_eq!(code, Some(0));
+    (json(&out)["channels"][channel].clone(), json(&counted)["channels"][channel].clone(), err)
+}
+
+#[test]
+fn a_bus_with_nothing_but_errors_is_told_from_a_silent_one() {
+    let (captured, counted, err) =
+        captured_and_counted("-d virtual:errors=100,load=100 -c 2 -b 1M -t 400ms", 0);
+    assert_eq!(captured["frames"], 0);
+    assert!(captured["bus_errors"].as_u64() > Some(100), "{captured}");
+    assert!(counted["errors"]["suppressed"].as_u64() > Some(0), "{counted}");
+    assert_eq!(captured["bus_errors"], counted["errors"]["total"]);
+    assert!(
+        err.contains("channel 2: only errors and no frame, which usually means a wrong bit rate"),
+        "{err}"
+    );
+    assert!(err.contains("`cantap autobaud`"), "{err}");
+    // The other node's rate is another.
+    let (code, _, err) = cantap("capture -d virtual:load=50,bitrate=250k -c 1 -b 500k -t 300ms");
+    assert_eq!(code, Some(0));
+    let line = err.lines().find(|line| line.starts_with("channel 1: 0 frames, ")).unwrap();
+    assert!(line.ends_with(" bus errors") && !line.ends_with(" 0 bus errors"), "{err}");
+    assert!(err.contains("`cantap autobaud`"), "{err}");
+    // A bus with both, and one with neither, need no advice.
+    let (captured, counted, err) =
+        captured_and_counted("-d virtual:errors=30,load=60 -c 1 -b 500k -t 400ms", 0);
+    assert!(
+        captured["frames"].as_u64() > Some(10) && captured["bus_errors"].as_u64() > Some(10),
+        "{captured}"
+    );
+    assert_eq!(captured["bus_errors"], counted["errors"]["total"]);
+    assert!(!err.contains("autobaud"), "{err}");
+    let (_, _, err) = cantap("capture -d virtual:load=0 -c 1 -b 500k -t 100ms");
+    assert!(err.contains(" 0 lost, 0 bus errors") && !err.contains("autobaud"), "{err}");
+    // Errors say how the bus is, whatever is captured of it.
+    let (_, out, err) =
+        cantap("capture -d virtual:errors=100,load=100 -c 1 -b 1M -t 300ms -f can0,123:7FF --json");
+    assert!(json(&out)["channels"][0]["bus_errors"].as_u64() > Some(100), "{out}");
+    assert!(!err.contains("autobaud"), "{err}");
+}
+
+#[test]
+fn data_that_was_left_out_is_told_and_gives_no_load() {
+    let line = "capture -d virtual:load=50,frames=std8 -c 1 -b 500k -n 30 --no-data";
+    let (code, out, err) = cantap(line);
+    assert_eq!((code, out.lines().count()), (Some(0), 30));
+    let notice = "cantap: standard output does not carry the data that the device left out, and has zeros in its place (30)";
+    assert!(err.lines().any(|line| line == notice), "{err}");
+    assert!(err.contains("channel 1: 30 frames, ") && !err.contains("bus load"), "{err}");
+    let (_, out, err) = cantap(&format!("{line} --json"));
+    assert_eq!(err, "");
+    let channel = &json(&out)["channels"][0];
+    assert!(channel["bus_load_pct"].is_null() && channel["frames_per_s"].is_f64(), "{out}");
+    // Frames without data lack nothing.
+    let (_, _, err) = cantap("capture -d virtual:load=50,frames=std0 -c 1 -b 500k -n 30 --no-data");
+    assert!(err.contains("bus load ") && !err.contains("zeros"), "{err}");
+}
+
+#[test]
+fn times_that_were_left_out_give_neither_rate_nor_load() {
+    let line = "capture -d virtual:load=50 -c 1 -b 500k -t 300ms --no-stamps";
+    let (code, _, err) = cantap(line);
+    assert_eq!(code, Some(0));
+    assert!(err.contains("does not carry the mark of times that are only upper bounds"), "{err}");
+    assert!(!err.contains("frames/s") && !err.contains("bus load"), "{err}");
+    let (_, out, _) = cantap(&format!("{line} --json"));
+    let channel = &json(&out)["channels"][0];
+    assert!(channel["bus_load_pct"].is_null() && channel["frames_per_s"].is_null(), "{out}");
+    assert!(channel["frames"].as_u64() > Some(100), "{out}");
+}
+
+#[test]
+fn a_timing_out_of_range_is_told_in_words() {
+    for (option, part) in [
+        ("--segments 9,6,1,2", "the jump width is out of range"),
+        ("--segments 9,17,2,2", "segment 1 (PROP+PS1) is out of range"),
+        ("--btr 0x03000000", "the jump width is out of range"),
+    ] {
+        let (code, _, err) = cantap(&format!("capture -d virtual {option}"));
+        assert!(code == Some(2) && err.contains(part) && !err.contains('{'), "{err}");
+    }
+}
+
 #[test]
 fn what_cannot_work_is_one_line_with_the_next_step() {
-    for (arguments, message) in [
-        ("info -d /dev/there-is-none", "there is no device at '/dev/there-is-none'; `cantap list` shows"),
-        ("capture -d virtual -b 999999", "the nearest it reaches: 947368 and 1000000 bit/s"),
+    for (arguments, wanted, message) in [
+        ("info -d /dev/there-is-none", 1, "there is no device at '/dev/there-is-none'; `cantap list` shows"),
+        ("info -d emu:there-is-none.elf", 1, "cannot read there-is-none.elf"),
+        ("capture -d virtual -b 999999", 1, "the nearest it reaches: 947368 and 1000000 bit/s"),
         (
             "capture -d virtual -b 2M",
+            1,
             "a bit rate of 2000000 bit/s is impossible; choose one from 5000 to 1000000",
         ),
-        ("capture -d virtual -b 500k -o /nowhere/x.log", "cannot write to '/nowhere/x.log'; choose a folder"),
-        ("info -d virtual:speed=9", "there is no option 'speed'; there are load, frames"),
-        ("info -d virtual:log=/nowhere.log", "'/nowhere.log' does not fit the option 'log'"),
+        (
+            "capture -d virtual -b 500k -o /nowhere/x.log",
+            1,
+            "cannot write to '/nowhere/x.log'; choose a folder",
+        ),
+        ("info -d virtual:speed=9", 2, "there is no option 'speed'; there are load, frames"),
+        ("info -d virtual:load=101", 2, "'101' does not fit the option 'load': give per cent, 0 to 100"),
+        ("info -d virtual:log=/nowhere.log", 2, "'/nowhere.log' does not fit the option 'log'"),
+        ("info -d emu:any.elf,load=101", 2, "'101' does not fit the option 'load': give per cent, 0 to 100"),
+        ("capture -d virtual -b 500k -b 3:250k", 2, "a device has no channel 3"),
+        ("capture -d virtual -b 3:250k", 2, "a device has no channel 3"),
+        ("capture -d virtual --sjw 2", 2, "needs a bit rate; add -b RATE"),
     ] {
         let (code, out, err) = cantap(arguments);
-        assert_eq!((code, out.as_str(), err.lines().count()), (Some(1), "", 1), "{arguments}: {err}");
+        assert_eq!((code, out.as_str(), err.lines().count()), (Some(wanted), "", 1), "{arguments}: {err}");
         assert!(err.starts_with("cantap: ") && err.contains(message), "{arguments}: {err}");
     }
     assert_eq!(cantap("capture -d virtual").0, Some(2));

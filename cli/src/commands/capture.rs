@@ -10,10 +10,11 @@ use cantap::device::Records;
 use cantap::filter::Filter;
 use cantap::formats::{Format, ReadOptions, TraceWriter, create_writer, open_reader};
 use cantap::trigger::{Trigger, TriggerCounts};
+use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
-use cantap::{Address, Channel, Device, TraceRecord};
+use cantap::{Address, Channel, Device, TraceEvent, TraceRecord};
 
-use super::convert::{WriteArgs, report as report_left_out};
+use super::convert::{WriteArgs, report as report_left_out, shown};
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::interrupt;
@@ -27,6 +28,9 @@ use crate::trigger_args::TriggerArgs;
 #[command(
     after_help = "Channels only listen, unless --mode says otherwise: nothing is sent and nothing acknowledged.\n\
                         Without -o the trace goes to standard output, unless --json is given.\n\n\
+                        The summary counts a channel's bus errors whatever the filters, those reported and those only counted. With \
+                        --no-stamps\nit has no frames/s and no bus load, with --no-data no bus load where data was left out \
+                        (null with --json): they are not known.\n\n\
                         Examples:\n  cantap capture -d /dev/ttyACM0 -b 500k -o drive.log\n  \
                         cantap capture -d virtual -b 1M -n 1000\n  \
                         cantap capture -d COM5 -c 2 -b 250k -t 60s -o trace.blf --json\n  \
@@ -41,8 +45,8 @@ pub struct Args {
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,
-    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. In hardware as far as it can. Repeat for any of
-    /// several.
+    /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. In hardware as far as it can, where 123:7FF counts
+    /// twice (standard and extended) and 123:C00007FF once. Repeat for any of several.
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<Filter>,
     /// File to write; its suffix picks the format, if --format does not. Without a suffix it is a candump log.
@@ -74,8 +78,11 @@ struct ChannelSummary {
     channel: u8,
     frames: u64,
     lost: u64,
-    frames_per_s: f64,
-    bus_load_pct: f64,
+    /// Reported and suppressed ones, whatever the filters.
+    bus_errors: u64,
+    /// `null` where the device left out what it takes to know it, as the next one.
+    frames_per_s: Option<f64>,
+    bus_load_pct: Option<f64>,
 }
 
 #[derive(serde::Serialize)]
@@ -128,12 +135,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut sink = Sink::create(args)?;
     let opened = args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&args.filter))?;
     let started = Instant::now();
-    let bitrate = |channel| {
-        // A channel that is not open has no frames, whatever its rate.
-        let config = opened.iter().find(|(opened, _)| *opened == channel).or(opened.first());
-        config.map_or(0, |(_, config)| config.timing.bitrate_bps(device.hello().can_clock_hz))
-    };
-    let mut meters = Channel::ALL.map(|channel| Meter::new(bitrate(channel)));
+    let mut meters = Channel::ALL.map(|_| Meter::new(0));
+    for (channel, config) in &opened {
+        meters[channel.index()] = Meter::of(config, device.hello().can_clock_hz);
+        sink.omits_data[channel.index()] = config.omit_data;
+    }
     let mut records = device.records();
     let mut rescue = args.open.rescue(&device);
     let end = write_until_asked(args, &mut records, &mut sink, &mut meters, &mut rescue);
@@ -168,6 +174,12 @@ impl Args {
     fn accepts(&self, record: &TraceRecord) -> bool {
         self.filter.is_empty() || self.filter.iter().any(|filter| filter.accepts(record))
     }
+
+    /// Whether a record counts in the summary: errors say how the bus is, whatever is captured of it.
+    fn counts(&self, record: &TraceRecord) -> bool {
+        matches!(record.event, TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. })
+            || self.accepts(record)
+    }
 }
 
 /// Why writing ended.
@@ -195,8 +207,11 @@ fn write_until_asked(
             return Ok(End::Asked);
         }
         let Some(batch) = records.next_batch(LOOK_EVERY)? else { return Ok(End::Enough) };
-        for record in batch.iter().filter(|record| args.accepts(record)) {
+        for record in batch.iter().filter(|record| args.counts(record)) {
             meters[usize::from(record.channel == 2)].push(record);
+            if !args.accepts(record) {
+                continue;
+            }
             if !sink.write(record)? {
                 return Ok(End::NobodyReads);
             }
@@ -220,10 +235,10 @@ fn write_until_asked(
 fn drain(args: &Args, records: &mut Records, sink: &mut Sink, meters: &mut [Meter; 2]) -> anyhow::Result<()> {
     for record in records {
         let record = record?;
-        if !args.accepts(&record) {
+        if !args.counts(&record) {
             continue;
         }
-        if is_enough(args, meters) || !sink.write(&record)? {
+        if is_enough(args, meters) || args.accepts(&record) && !sink.write(&record)? {
             break;
         }
         meters[usize::from(record.channel == 2)].push(&record);
@@ -241,8 +256,31 @@ fn summarize(channel: Channel, meters: &[Meter; 2]) -> ChannelSummary {
         channel: channel.number(),
         frames: meter.frames(),
         lost: meter.lost(),
-        frames_per_s: rounded(meter.frames_per_s(), 1),
-        bus_load_pct: rounded(meter.bus_load_pct(), 2),
+        bus_errors: meter.bus_errors(),
+        frames_per_s: meter.frames_per_s().map(|rate| rounded(rate, 1)),
+        bus_load_pct: meter.bus_load_pct().map(|load| rounded(load, 2)),
+    }
+}
+
+impl ChannelSummary {
+    /// One line, without what is not known.
+    fn line(&self) -> String {
+        let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct } = self;
+        let rate = frames_per_s.map_or_else(String::new, |rate| format!(", {rate} frames/s"));
+        let load = bus_load_pct.map_or_else(String::new, |load| format!(", bus load {load} %"));
+        format!("channel {channel}: {frames} frames{rate}{load}, {lost} lost, {bus_errors} bus errors")
+    }
+}
+
+/// Says what it usually means that channels heard errors and no frame. With a filter, frames may be there all the same.
+fn explain_errors(args: &Args, summary: &Summary) {
+    let has_errors_only = |channel: &&ChannelSummary| channel.frames == 0 && channel.bus_errors > 0;
+    for channel in summary.channels.iter().filter(has_errors_only).filter(|_| args.filter.is_empty()) {
+        eprintln!(
+            "cantap: channel {}: only errors and no frame, which usually means a wrong bit rate or a broken bus; `cantap \
+             autobaud` finds the bit rate, if the bus is whole",
+            channel.channel
+        );
     }
 }
 
@@ -263,16 +301,14 @@ fn frames_in_file(args: &Args) -> Option<u64> {
 }
 
 fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
+    explain_errors(args, summary);
     if args.json {
         writeln!(io::stdout().lock(), "{}", serde_json::to_string(summary)?)?;
         return Ok(());
     }
     eprintln!("captured {} s", summary.seconds);
     for channel in &summary.channels {
-        let ChannelSummary { channel, frames, lost, frames_per_s, bus_load_pct } = channel;
-        eprintln!(
-            "channel {channel}: {frames} frames, {frames_per_s} frames/s, bus load {bus_load_pct} %, {lost} lost"
-        );
+        eprintln!("{}", channel.line());
     }
     if let Some(TriggerSummary { events, kept, forgotten }) = &summary.trigger {
         eprintln!("trigger: {events} events, {kept} records kept");
@@ -300,31 +336,46 @@ struct Sink {
     name: String,
     to_stdout: bool,
     trigger: Option<Trigger>,
+    /// Which channels were opened to leave data out.
+    omits_data: [bool; CHANNELS],
+    /// Frames written whose data is not known.
+    without_data: u64,
 }
 
 impl Sink {
     fn create(args: &Args) -> anyhow::Result<Self> {
-        let trigger = args.trigger.trigger()?;
+        let mut sink = Self {
+            writer: None,
+            name: String::new(),
+            to_stdout: false,
+            trigger: args.trigger.trigger()?,
+            omits_data: [false; CHANNELS],
+            without_data: 0,
+        };
         let path = match &args.output {
             Some(path) => path.as_path(),
             // Standard output is for one JSON object then.
-            None if args.json => {
-                return Ok(Self { writer: None, name: String::new(), to_stdout: false, trigger });
-            }
+            None if args.json => return Ok(sink),
             None => Path::new("-"),
         };
         let options = args.write.options(implied_format(path))?;
-        let name = path.display().to_string();
+        sink.name = path.display().to_string();
+        sink.to_stdout = sink.name == "-";
         let writer = create_writer(path, &options).with_context(|| {
-            format!("cannot write to '{name}'; choose a folder and name that you may write")
+            format!("cannot write to '{}'; choose a folder and name that you may write", sink.name)
         })?;
-        Ok(Self { writer: Some(writer), to_stdout: name == "-", name, trigger })
+        sink.writer = Some(writer);
+        Ok(sink)
     }
 
     /// Writes a record, if the trigger does not hold it back. Returns whether anybody still reads.
     fn write(&mut self, record: &TraceRecord) -> anyhow::Result<bool> {
-        let writer = &mut self.writer;
-        let mut write = |record: &TraceRecord| writer.as_mut().map_or(Ok(()), |writer| writer.write(record));
+        let Self { writer, omits_data, without_data, .. } = self;
+        let mut write = |record: &TraceRecord| {
+            let has_data = record.frame().is_some_and(|frame| frame.data_len() > 0);
+            *without_data += u64::from(has_data && omits_data[usize::from(record.channel == 2)]);
+            writer.as_mut().map_or(Ok(()), |writer| writer.write(record))
+        };
         let result = match &mut self.trigger {
             Some(trigger) => trigger.push(record, write),
             None => write(record),
@@ -364,7 +415,15 @@ impl Sink {
         let Some(writer) = self.writer.take() else { return Ok(()) };
         match writer.finish() {
             Ok(left_out) => {
-                report_left_out(&left_out, Path::new(&self.name));
+                let path = Path::new(&self.name);
+                report_left_out(&left_out, path);
+                if self.without_data > 0 {
+                    eprintln!(
+                        "cantap: {} does not carry the data that the device left out, and has zeros in its place ({})",
+                        shown(path),
+                        self.without_data
+                    );
+                }
                 Ok(())
             }
             Err(error) if self.to_stdout && error.kind() == io::ErrorKind::BrokenPipe => Ok(()),

@@ -169,8 +169,8 @@ impl Books {
             sent: heard[channel.index()],
             delivered: check.delivered(),
             lost: check.lost(),
-            frames_per_s: rounded(meter.frames_per_s(), 1),
-            bus_load_pct: rounded(meter.bus_load_pct(), 2),
+            frames_per_s: rounded(meter.frames_per_s().unwrap_or(0.0), 1),
+            bus_load_pct: rounded(meter.bus_load_pct().unwrap_or(0.0), 2),
         }
     }
 }

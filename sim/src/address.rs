@@ -238,4 +238,18 @@ mod tests {
             assert!(error.contains(what), "{text}: {error}");
         }
     }
+
+    #[test]
+    fn every_option_stands_in_the_documentation() {
+        let docs = include_str!("../../docs/emulator.md");
+        let error = "a.elf,colour=9".parse::<Address>().unwrap_err().to_string();
+        let keys: Vec<&str> = error.split_once("there are ").unwrap().1.split(", ").collect();
+        for key in &keys {
+            assert!(docs.contains(&format!("\n| `{key}` | ")), "{key}");
+            // What it lists, it knows.
+            let error = format!("a.elf,{key}=").parse::<Address>().unwrap_err();
+            assert!(matches!(error, AddressError::Value { .. }), "{key}: {error}");
+        }
+        assert_eq!(keys.len(), 12);
+    }
 }

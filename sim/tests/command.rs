@@ -202,3 +202,28 @@ fn a_pty_is_announced_by_its_name_and_answers() {
     assert!(matches!(response.result, Ok(Reply::Hello(_))), "{response:?}");
     assert_eq!(server.wait().unwrap().code(), Some(0));
 }
+
+/// Asked politely, by Ctrl-C or by the system, it ends as a device that is no longer needed, whether a client is there or not.
+#[cfg(unix)]
+#[test]
+fn a_pty_ends_when_it_is_asked_to() {
+    use std::fs::File;
+    use std::io::{BufRead, BufReader};
+    use std::process::Stdio;
+
+    let Some(elf) = common::elf() else { return };
+    for (signal, has_client) in [("-INT", false), ("-TERM", false), ("-TERM", true)] {
+        let mut server = Command::new(env!("CARGO_BIN_EXE_cantap-sim"))
+            .args(["run", elf.to_str().unwrap(), "--pty", "--load", "5"])
+            .stdout(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let mut name = String::new();
+        BufReader::new(server.stdout.take().unwrap()).read_line(&mut name).unwrap();
+        let client = has_client.then(|| File::options().read(true).write(true).open(name.trim()).unwrap());
+        let asked = Command::new("kill").args([signal, &server.id().to_string()]).status().unwrap();
+        assert!(asked.success());
+        assert_eq!(server.wait().unwrap().code(), Some(0), "{signal}");
+        drop(client);
+    }
+}

@@ -150,8 +150,9 @@ impl<'q, const N: usize> Capture<'q, N> {
             let Some(next) = self.next_due(Transmitter::next_queued).filter(|due| *due <= now + early) else {
                 return;
             };
-            // What is due soon after it would find no time for this between the two.
-            let until = next.max(now) + early / 2;
+            // What is due soon after it would find no time for this between the two. A periodic frame is not waited past.
+            let periodic = self.next_due(Transmitter::next_periodic).unwrap_or(u64::MAX);
+            let until = (next.max(now) + early / 2).min(periodic);
             let mut ready = [const { None }; CHANNELS];
             for ((state, traffic), ready) in self.channels.iter_mut().zip(traffic.iter_mut()).zip(&mut ready)
             {
@@ -171,9 +172,11 @@ impl<'q, const N: usize> Capture<'q, N> {
                 }
                 traffic[channel].request(mailbox);
             }
-            for (state, ready) in self.channels.iter_mut().zip(ready) {
+            for ((state, traffic), ready) in self.channels.iter_mut().zip(traffic.iter_mut()).zip(ready) {
                 if let Some((mailbox, _)) = ready {
                     state.transmitter.requested(mailbox);
+                    // Without a time, behind the one that had one.
+                    state.transmitter.load_due(traffic, now);
                 }
             }
         }
@@ -198,10 +201,15 @@ impl<'q, const N: usize> Capture<'q, N> {
             clock.wait_until(due as u32);
             now = self.recorder.time(clock.now());
         }
-        for (state, traffic) in self.channels.iter_mut().zip(traffic) {
+        let mut serviced = false;
+        for (state, traffic) in self.channels.iter_mut().zip(traffic.iter_mut()) {
             if state.open.is_some() && state.transmitter.has_more(now) {
                 state.transmitter.service(traffic, &mut self.recorder, now);
+                serviced = true;
             }
+        }
+        if serviced {
+            self.load_in_time(traffic, clock);
         }
         self.arm(clock);
     }
@@ -331,8 +339,16 @@ impl<'q, const N: usize> Capture<'q, N> {
         true
     }
 
+    /// Nobody listens any more: nothing more is sent. The channel is still on the bus.
+    pub fn begin_abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
+        self.channels[channel.index()].transmitter.clear();
+        traffic.abort();
+    }
+
     /// The channel has left the bus and nobody listens: forgets it, unrecorded.
     pub fn abandon(&mut self, channel: Channel, traffic: &mut impl Traffic) {
+        // Whatever is still in a mailbox would go out in the next session.
+        traffic.abort();
         while traffic.receive().is_some() {}
         traffic.take_overrun();
         while traffic.take_finished().is_some() {}

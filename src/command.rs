@@ -153,7 +153,14 @@ impl Commands {
     pub fn begin<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) -> Step {
         self.begun = board.now();
         match work {
-            Work::Silence => Channel::ALL.iter().for_each(|&channel| board.control(channel).stop()),
+            Work::Silence => {
+                for channel in Channel::ALL {
+                    board.with_capture(|capture, traffic, _| {
+                        capture.begin_abandon(channel, &mut traffic[channel.index()]);
+                    });
+                    board.control(channel).stop();
+                }
+            }
             Work::Close(channel) | Work::Recover(channel) => board.control(channel).stop(),
             Work::Open(..) | Work::Restart | Work::Bootloader => {}
         }

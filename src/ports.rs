@@ -21,7 +21,7 @@ pub trait Clock {
     /// Ticks by which the alarm is set before its time, so that an interrupt that is under way then has ended when
     /// the time comes; the rest is left to [`Self::wait_until`]. None where no interrupt is ever late.
     const ALARM_EARLY_TICKS: u32 = 0;
-    /// Waits for a time that is at most [`Self::ALARM_EARLY_TICKS`] ahead.
+    /// Waits for a time that is at most one and a half times [`Self::ALARM_EARLY_TICKS`] ahead.
     fn wait_until(&self, _at: u32) {}
 }
 

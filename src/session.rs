@@ -104,7 +104,10 @@ impl<'q, const N: usize> Session<'q, N> {
             self.inbox.clear();
             self.outbox.clear();
             self.answers.clear();
-            self.begin(Work::Silence, Origin::Device, board);
+            // A host that asked for a restart may be gone before it comes.
+            if !matches!(self.work, Some((Work::Restart | Work::Bootloader, _))) {
+                self.begin(Work::Silence, Origin::Device, board);
+            }
         }
         self.look_after_work(board);
     }
@@ -141,6 +144,7 @@ impl<'q, const N: usize> Session<'q, N> {
                 if matches!(work, Work::Silence) {
                     self.language = Language::Native { greeted: true };
                     self.outbox.clear();
+                    self.answers.clear();
                 }
                 self.answers.add(id, &result);
             }

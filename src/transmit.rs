@@ -1,6 +1,6 @@
 //! Puts frames on the bus: a queue in order, frames at their time, periodic frames, replies.
 //!
-//! One per channel, in the highest-priority interrupts. Mailboxes leave in the order they were filled.
+//! One per channel, in the highest-priority interrupts. Mailboxes leave in the order in which they were requested.
 //! Whenever one is free, a reply goes first, then a periodic frame that is due, then the queue's head once
 //! its time has come.
 
@@ -285,7 +285,7 @@ impl Transmitter {
         let &Queued { ref frame, at, .. } = self.queue.front()?;
         // Whatever is in a mailbox must find room to be kept when it has finished.
         let kept = self.unconfirmed.len() + self.mailboxes.iter().flatten().count();
-        if at > until || kept >= self.unconfirmed.capacity() || self.has_more(now) {
+        if at > until || kept >= self.unconfirmed.capacity() || self.has_more(now.max(at)) {
             return None;
         }
         Some((traffic.prepare(frame)?, at))

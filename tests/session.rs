@@ -232,6 +232,40 @@ fn a_restart_is_answered_before_it_happens() {
 }
 
 #[test]
+fn a_restart_happens_though_the_host_is_gone_as_soon_as_it_is_answered() {
+    for command in [Command::Reset, Command::Bootloader] {
+        let queue = RecordQueue::<SMALL_QUEUE>::new();
+        let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+        assert_eq!(bench.ask(command.clone()), Ok(Reply::Done));
+        bench.port.open = false;
+        for _ in 0..100 {
+            bench.millisecond();
+        }
+        let bootloader = usize::from(matches!(command, Command::Bootloader));
+        assert_eq!((bench.board.chip.resets, bench.board.chip.bootloaders), (1, bootloader), "{command:?}");
+    }
+}
+
+/// What a program that ended asked is no answer for the next.
+#[test]
+fn a_greeting_takes_back_the_answers_that_were_not_sent_yet() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.responses.clear();
+    bench.port.takes = 0;
+    for id in 900..905 {
+        bench.say(&encode(&Request { id, command: Command::Time }));
+    }
+    bench.say(&encode(&Request { id: 950, command: Command::Hello { protocol: PROTOCOL_VERSION } }));
+    bench.millisecond();
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    let answered: Vec<u16> = bench.responses.iter().map(|response| response.id).collect();
+    assert_eq!(answered, [950]);
+    assert_eq!(bench.complaints, Vec::<String>::new());
+}
+
+#[test]
 fn opening_and_closing_one_channel_leaves_the_other_alone() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::opened(&queue, Mode::ListenOnly);

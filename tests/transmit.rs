@@ -2,6 +2,7 @@
 
 mod fakes;
 
+use cantap_firmware::ports::Clock;
 use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::transmit::TX_QUEUE;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
@@ -11,10 +12,12 @@ use cantap_wire::message::{
 };
 use cantap_wire::record::{ErrorState, TransmitFailure};
 use cantap_wire::{Channel, Command, Event, Frame, Record, Refusal, Reply};
-use fakes::{Bench, SMALL_QUEUE, config, numbered};
+use fakes::{Bench, FakeClock, SMALL_QUEUE, config, numbered};
 
 const CAN1: Channel = Channel::Can1;
 const CAN2: Channel = Channel::Can2;
+
+const EARLY: u32 = FakeClock::ALARM_EARLY_TICKS;
 
 type Queue = RecordQueue<SMALL_QUEUE>;
 
@@ -93,16 +96,79 @@ fn a_frame_waits_for_its_time_and_later_ones_wait_for_it() {
         .collect();
     bench.ask(Command::Send { channel: CAN1, frames }).unwrap();
     assert_eq!(bench.send_one(CAN1), None);
-    assert_eq!(bench.board.clock.alarm.get(), Some(due));
-    bench.board.clock.now.set(due - 1);
+    assert_eq!(bench.board.clock.alarm.get(), Some(due - EARLY));
+    bench.board.clock.now.set(due - EARLY - 1);
     bench.alarm();
     assert_eq!(bench.send_one(CAN1), None);
-    bench.board.clock.now.set(due);
+    bench.board.clock.now.set(due - EARLY);
     bench.alarm();
+    assert_eq!(bench.board.clock.now.get(), due);
+    assert_eq!(bench.board.traffic[0].order.len(), 2);
     assert_eq!(bench.send_one(CAN1), Some(numbered(0)));
     assert_eq!(bench.send_one(CAN1), Some(numbered(1)));
     assert_eq!(bench.send_one(CAN1), None);
-    assert_eq!(bench.board.clock.alarm.get(), Some(due + 1000));
+    assert_eq!(bench.board.clock.alarm.get(), Some(due + 1000 - EARLY));
+}
+
+#[test]
+fn frames_that_are_due_together_leave_together_on_both_channels() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let due = bench.board.clock.now.get() + 5 * TICKS_PER_MS;
+    for (channel, at) in [(CAN1, due + 40), (CAN2, due), (CAN1, due + 90), (CAN2, due + 2000)] {
+        let frame = TxFrame { tag: at, frame: numbered(at), at_ticks: Some(at.into()) };
+        bench.ask(Command::Send { channel, frames: [frame].into_iter().collect() }).unwrap();
+    }
+    bench.board.clock.now.set(due - EARLY);
+    bench.alarm();
+    assert_eq!(bench.board.clock.now.get(), due + 90);
+    assert_eq!(bench.board.traffic.each_ref().map(|traffic| traffic.order.len()), [2, 1]);
+    assert_eq!(bench.send_one(CAN1), Some(numbered(due + 40)));
+    assert_eq!(bench.send_one(CAN1), Some(numbered(due + 90)));
+    assert_eq!(bench.send_one(CAN2), Some(numbered(due)));
+    assert_eq!(bench.board.clock.alarm.get(), Some(due + 2000 - EARLY));
+}
+
+#[test]
+fn a_periodic_frame_goes_before_a_queued_one_that_is_due_a_moment_later() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let entry = Some(periodic("100#", 1, 0, &[]));
+    bench.ask(Command::SetPeriodic { channel: CAN1, slot: 0, entry }).unwrap();
+    let first = bench.board.clock.now.get();
+    assert!(bench.send_one(CAN1).is_some());
+    let due = first + TICKS_PER_MS;
+    for channel in [CAN1, CAN2] {
+        let frame = TxFrame { tag: 1, frame: numbered(1), at_ticks: Some((due + 60).into()) };
+        bench.ask(Command::Send { channel, frames: [frame].into_iter().collect() }).unwrap();
+    }
+    bench.board.clock.now.set(due - 30);
+    bench.alarm();
+    assert_eq!(bench.send_one(CAN1), Some("100#".parse().unwrap()));
+    assert_eq!(bench.send_one(CAN1), Some(numbered(1)));
+    assert_eq!(bench.send_one(CAN2), Some(numbered(1)));
+}
+
+/// A bus on which nobody acknowledges keeps frames in their mailboxes, and a host may go meanwhile.
+#[test]
+fn nothing_of_a_session_is_sent_in_the_next() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    send(&mut bench, 0..5).unwrap();
+    assert_eq!(bench.board.traffic[0].order.len(), 3);
+    bench.port.open = false;
+    flush(&mut bench);
+    bench.port.open = true;
+    bench.greet();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::Normal)) }).unwrap();
+    assert_eq!(bench.send_one(CAN1), None);
+    let due = bench.board.clock.now.get() + TICKS_PER_MS;
+    let frame = TxFrame { tag: 77, frame: numbered(77), at_ticks: Some(due.into()) };
+    bench.ask(Command::Send { channel: CAN1, frames: [frame].into_iter().collect() }).unwrap();
+    bench.board.clock.now.set(due - EARLY);
+    bench.alarm();
+    assert_eq!(bench.send_one(CAN1), Some(numbered(77)));
+    assert_eq!(bench.board.clock.alarm.get(), None);
 }
 
 #[test]

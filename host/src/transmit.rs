@@ -1,6 +1,6 @@
 //! Sends frames in a stream: many under way at once, never more than the device's queue holds, each accounted for.
 //!
-//! A request carries a few frames and its answer takes a USB round trip, so several requests are under way at a time. What
+//! A request carries up to 20 frames and its answer takes a USB round trip, so several requests are under way at a time. What
 //! is not confirmed yet is counted, and no more is sent than fits the device's queue: it never refuses, so
 //! the order is kept.
 

@@ -58,7 +58,7 @@ impl Clock for StampTimer {
 
     #[inline]
     fn wait_until(&self, at: u32) {
-        // Bounded: whoever calls this has found that the time is at most ALARM_EARLY_TICKS ahead.
+        // Bounded: whoever calls this has found that the time is at most 1.5 ALARM_EARLY_TICKS ahead.
         while (at.wrapping_sub(self.now()) as i32) > 0 {}
     }
 

@@ -4,6 +4,7 @@
 use std::cell::Cell;
 use std::collections::VecDeque;
 
+use cantap_firmware::TICKS_PER_US;
 use cantap_firmware::capture::Capture;
 use cantap_firmware::command::Identity;
 use cantap_firmware::filters::Layout;
@@ -32,6 +33,16 @@ pub struct FakeClock {
 }
 
 impl Clock for FakeClock {
+    const ALARM_EARLY_TICKS: u32 = 10 * TICKS_PER_US;
+
+    fn wait_until(&self, at: u32) {
+        let ahead = at.wrapping_sub(self.now.get());
+        assert!(ahead <= Self::ALARM_EARLY_TICKS * 3 / 2 || ahead > u32::MAX / 2, "waits {ahead} ticks");
+        if ahead <= u32::MAX / 2 {
+            self.now.set(at);
+        }
+    }
+
     fn now(&self) -> u32 {
         self.now.replace(self.now.get().wrapping_add(self.step.get()))
     }
@@ -48,7 +59,7 @@ pub struct FakeTraffic {
     pub overrun: bool,
     pub mailboxes: [Option<Frame>; 3],
     pub prepared: Option<Frame>,
-    /// The order in which mailboxes were filled.
+    /// The order in which mailboxes were requested.
     pub order: VecDeque<u8>,
     pub finished: VecDeque<(u8, Outcome)>,
     pub aborts: usize,

@@ -362,12 +362,13 @@ pub fn outline(bytes: &[u8]) -> Result<Outline, BadRecord> {
         return Ok(Outline { len, ticks, frame_of: Some(channel) });
     }
     // A confirmation: nearly all else, while a host streams.
-    if let [TRANSMITTED, _, ref rest @ ..] = *bytes {
+    if let [TRANSMITTED, 0 | 1, ref rest @ ..] = *bytes {
         let (_tag, rest) = take_u32(rest).ok_or(BadRecord)?;
         let (_id, rest) = take_u32(rest).ok_or(BadRecord)?;
-        let &[_dlc, len, ref rest @ ..] = rest else { return Err(BadRecord) };
-        let (ticks, after) = decode_ticks(rest.get(usize::from(len)..).ok_or(BadRecord)?)?;
-        return Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of: None });
+        if let [_dlc, len @ 0..=8, ref rest @ ..] = *rest {
+            let (ticks, after) = decode_ticks(rest.get(usize::from(len)..).ok_or(BadRecord)?)?;
+            return Ok(Outline { len: bytes.len() - after.len(), ticks, frame_of: None });
+        }
     }
     let (record, ticks, after) = decode(bytes)?;
     let frame_of = match record {

@@ -53,7 +53,7 @@ pub struct Controller {
     fifo: VecDeque<Frame>,
     overrun: bool,
     mailboxes: [Option<Frame>; MAILBOXES],
-    /// Mailboxes in the order in which they were filled.
+    /// Mailboxes in the order in which they were requested.
     order: VecDeque<u8>,
     /// Written to a mailbox and not requested.
     prepared: Option<Frame>,

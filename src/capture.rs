@@ -15,7 +15,7 @@ use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 use crate::queue::Producer;
 use crate::recorder::Recorder;
-use crate::transmit::Transmitter;
+use crate::transmit::{NEVER, Transmitter};
 
 /// An alarm is never set farther ahead than this, a quarter of the timer's range; it is set again then.
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
@@ -129,8 +129,6 @@ impl<'q, const N: usize> Capture<'q, N> {
         state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason);
         // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
         // than there is.
-        let now = self.recorder.time(clock.now());
-        state.transmitter.load_due(&mut traffic[channel.index()], now);
         self.load_in_time(traffic, clock);
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder, ended);
@@ -138,45 +136,45 @@ impl<'q, const N: usize> Capture<'q, N> {
         if !recorded || state.transmitter.has_more(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
         }
+        // That took a while, and the other channel's turn may come next: the alarm would be too late.
+        self.load_in_time(traffic, clock);
         self.arm(clock);
     }
 
-    /// Waits for what is due so soon that the alarm would come too late for it, on either channel, and sends it. All but the
+    /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it. All but the
     /// request itself is done ahead, so that two frames due at one moment leave at one moment.
     fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
+        let early = u64::from(C::ALARM_EARLY_TICKS);
         loop {
             let now = self.recorder.time(clock.now());
-            let early = u64::from(C::ALARM_EARLY_TICKS);
-            let Some(next) = self.next_due(Transmitter::next_queued).filter(|due| *due <= now + early) else {
+            let heads = self.due(Transmitter::head_due);
+            let next = heads[0].min(heads[1]);
+            if next > now + early {
                 return;
-            };
+            }
             // What is due soon after it would find no time for this between the two. A periodic frame is not waited past.
-            let periodic = self.next_due(Transmitter::next_periodic).unwrap_or(u64::MAX);
-            let until = (next.max(now) + early / 2).min(periodic);
-            let mut ready = [const { None }; CHANNELS];
-            for ((state, traffic), ready) in self.channels.iter_mut().zip(traffic.iter_mut()).zip(&mut ready)
-            {
-                if state.open.is_some() {
-                    *ready = state.transmitter.prepare_due(traffic, now, until);
+            let periodic = self.due(Transmitter::periodic_due);
+            let until = (next.max(now) + early / 2).min(periodic[0]).min(periodic[1]);
+            let mut mailboxes = [None; CHANNELS];
+            for (channel, mailbox) in mailboxes.iter_mut().enumerate() {
+                if heads[channel] <= until {
+                    let transmitter = &mut self.channels[channel].transmitter;
+                    *mailbox = transmitter.prepare_head(&mut traffic[channel], now.max(heads[channel]));
                 }
             }
-            let due = |channel: usize| ready[channel].map_or(u64::MAX, |(_, at)| at);
-            let order = if due(0) <= due(1) { [0, 1] } else { [1, 0] };
-            if due(order[0]) == u64::MAX {
+            if mailboxes == [None; CHANNELS] {
                 return;
             }
-            for channel in order {
-                let Some((mailbox, at)) = ready[channel] else { continue };
-                if at > now {
-                    clock.wait_until(at as u32);
+            for channel in if heads[0] <= heads[1] { [0, 1] } else { [1, 0] } {
+                let Some(mailbox) = mailboxes[channel] else { continue };
+                if heads[channel] > now {
+                    clock.wait_until(heads[channel] as u32);
                 }
                 traffic[channel].request(mailbox);
             }
-            for ((state, traffic), ready) in self.channels.iter_mut().zip(traffic.iter_mut()).zip(ready) {
-                if let Some((mailbox, _)) = ready {
+            for (state, mailbox) in self.channels.iter_mut().zip(mailboxes) {
+                if let Some(mailbox) = mailbox {
                     state.transmitter.requested(mailbox);
-                    // Without a time, behind the one that had one.
-                    state.transmitter.load_due(traffic, now);
                 }
             }
         }
@@ -194,10 +192,9 @@ impl<'q, const N: usize> Capture<'q, N> {
     pub fn on_alarm<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
         self.load_in_time(traffic, clock);
         let mut now = self.recorder.time(clock.now());
-        if let Some(due) = self.next_due(Transmitter::next_periodic)
-            && due > now
-            && due - now <= u64::from(C::ALARM_EARLY_TICKS)
-        {
+        let [first, second] = self.due(Transmitter::periodic_due);
+        let due = first.min(second);
+        if due > now && due - now <= u64::from(C::ALARM_EARLY_TICKS) {
             clock.wait_until(due as u32);
             now = self.recorder.time(clock.now());
         }
@@ -252,21 +249,22 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// When something is due for transmission next, on either channel.
-    fn next_due(&self, of: fn(&Transmitter) -> Option<u64>) -> Option<u64> {
-        let open = self.channels.iter().filter(|state| state.open.is_some());
-        open.filter_map(|state| of(&state.transmitter)).min()
+    /// When something is due on each open channel; [`NEVER`] on the others.
+    #[inline]
+    fn due(&self, of: impl Fn(&Transmitter) -> u64) -> [u64; CHANNELS] {
+        self.channels
+            .each_ref()
+            .map(|state| if state.open.is_some() { of(&state.transmitter) } else { NEVER })
     }
 
     /// Sets the alarm for what is due next.
     pub fn arm<C: Clock>(&mut self, clock: &C) {
         let now = self.recorder.time(clock.now());
-        let alarm = self.next_due(Transmitter::next_due).map(|due| {
-            let early = due.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
-            // Not earlier than now: a time that has passed for long would look like one that is far ahead.
-            early.clamp(now, now + ALARM_AHEAD_TICKS) as u32
-        });
-        clock.set_alarm(alarm);
+        let [first, second] = self.due(Transmitter::next_due);
+        let next = first.min(second);
+        let early = next.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
+        // Not earlier than now: a time that has passed for long would look like one that is far ahead.
+        clock.set_alarm((next != NEVER).then(|| early.clamp(now, now + ALARM_AHEAD_TICKS) as u32));
     }
 
     /// The 64-bit time now.

@@ -15,6 +15,7 @@ pub mod errors;
 pub mod filters;
 pub mod inbox;
 pub mod lights;
+mod mailboxes;
 pub mod outbox;
 pub mod ports;
 pub mod queue;

@@ -53,6 +53,9 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     language: Language,
     work: Option<(Work, Origin)>,
     answers: Answers,
+    /// The request being handled, and the packet being read: kept here, because clearing them on the stack takes time.
+    request: [u8; MAX_REQUEST_ENCODED],
+    packet: [u8; PACKET],
 }
 
 impl<'q, const N: usize> Session<'q, N> {
@@ -68,6 +71,8 @@ impl<'q, const N: usize> Session<'q, N> {
             language: Language::Unknown,
             work: None,
             answers: Answers::new(),
+            request: [0; MAX_REQUEST_ENCODED],
+            packet: [0; PACKET],
         }
     }
 
@@ -97,8 +102,7 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// The host is gone: the channels leave the bus, and nothing of it remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
-        let mut packet = [0; PACKET];
-        while port.read(&mut packet).is_some() {}
+        while port.read(&mut self.packet).is_some() {}
         if self.is_active() {
             self.language = Language::Unknown;
             self.inbox.clear();
@@ -116,9 +120,8 @@ impl<'q, const N: usize> Session<'q, N> {
     /// pipe behind it. What finds no room is dropped and counted; a host that waits for responses
     /// never gets there.
     fn read(&mut self, port: &mut impl Port) {
-        let mut packet = [0; PACKET];
-        while let Some(len) = port.read(&mut packet) {
-            if !self.inbox.push(&packet[..len]) {
+        while let Some(len) = port.read(&mut self.packet) {
+            if !self.inbox.push(&self.packet[..len]) {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
             }
         }
@@ -195,38 +198,37 @@ impl<'q, const N: usize> Session<'q, N> {
     }
 
     fn handle_request(&mut self, greeted: bool, board: &mut impl Board<'q, N>) -> bool {
-        // Most packets end no request: the room is not cleared for them.
-        let mut room = None;
-        let taken = self.inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| {
-            unseal(encoded, room.insert([0; MAX_REQUEST_ENCODED])).ok()
-        });
-        let Some(message) = taken else { return false };
-        let Some(message) = message.flatten() else {
+        let Self { inbox, request, .. } = self;
+        let taken =
+            inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| unseal(encoded, request).map(<[u8]>::len));
+        let Some(len) = taken else { return false };
+        let Some(Ok(len)) = len else {
             // Damaged: there is no telling whom to answer.
             self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
             return true;
         };
-        if !(greeted && self.execute_send(message, board)) {
-            self.execute(message, greeted, board);
+        if !(greeted && self.execute_send(len, board)) {
+            self.execute(len, greeted, board);
         }
         true
     }
 
-    /// Queues the frames of a request to send; returns whether it was one.
+    /// Queues the frames of the request to send, of so many bytes; returns whether it is one.
     ///
     /// Not inlined, nor is what does the other requests: neither is to take the stack that only the other needs.
     #[inline(never)]
-    fn execute_send(&mut self, message: &[u8], board: &mut impl Board<'q, N>) -> bool {
+    fn execute_send(&mut self, len: usize, board: &mut impl Board<'q, N>) -> bool {
         let mut frames = heapless::Vec::new();
-        let Some((id, channel)) = read_send(message, &mut frames) else { return false };
+        let Some((id, channel)) = read_send(&self.request[..len], &mut frames) else { return false };
         let queued = send(channel, &frames, board);
         self.answers.add(id, &queued.map(|free| Reply::Queued { free }));
         true
     }
 
-    /// Does what a request asks for.
+    /// Does what the request, of so many bytes, asks for.
     #[inline(never)]
-    fn execute(&mut self, message: &[u8], greeted: bool, board: &mut impl Board<'q, N>) {
+    fn execute(&mut self, len: usize, greeted: bool, board: &mut impl Board<'q, N>) {
+        let message = &self.request[..len];
         let (id, result) = match postcard::from_bytes(message) {
             Ok(Request { id, command }) if greeted || matches!(command, Command::Hello { .. }) => {
                 (id, self.commands.execute(command, board))

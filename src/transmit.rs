@@ -11,6 +11,7 @@ use heapless::Deque;
 
 use crate::TICKS_PER_US;
 use crate::checksum::checksum;
+use crate::mailboxes::Mailboxes;
 use crate::ports::{Outcome, Traffic};
 use crate::recorder::Recorder;
 
@@ -29,7 +30,7 @@ pub const MIN_PERIOD_TICKS: u32 = 47 * TICKS_PER_US;
 /// the processor from the capture.
 const LOOK_EVERY_TICKS: u64 = 20 * TICKS_PER_US as u64;
 /// "Never", for due times.
-const NEVER: u64 = u64::MAX;
+pub const NEVER: u64 = u64::MAX;
 
 #[derive(Clone, Copy)]
 struct Queued {
@@ -59,11 +60,10 @@ struct TriggerState {
 pub struct Transmitter {
     channel: Channel,
     queue: Deque<Queued, TX_QUEUE>,
-    mailboxes: [Option<(u32, Frame)>; MAILBOXES],
+    mailboxes: Mailboxes,
     periodic: [Option<PeriodicState>; PERIODIC_SLOTS],
-    /// The earliest due time among the periodic entries.
+    /// When the periodic entries are to be looked at: at the earliest due time among them, but not before `look_from`.
     periodic_due: u64,
-    /// They are not looked at before this time.
     look_from: u64,
     periodic_waiting: u8,
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
@@ -85,7 +85,7 @@ impl Transmitter {
         Self {
             channel,
             queue: Deque::new(),
-            mailboxes: [None; MAILBOXES],
+            mailboxes: Mailboxes::new(),
             periodic: [const { None }; PERIODIC_SLOTS],
             periodic_due: NEVER,
             look_from: 0,
@@ -114,7 +114,7 @@ impl Transmitter {
 
     /// Frames in the queue or a mailbox.
     pub fn pending(&self) -> usize {
-        self.queue.len() + self.mailboxes.iter().flatten().count()
+        self.queue.len() + self.mailboxes.len()
     }
 
     /// Whether everything has ended and is recorded.
@@ -150,7 +150,8 @@ impl Transmitter {
     fn count_periodic(&mut self) {
         let entries = || self.periodic.iter().flatten();
         self.periodic_waiting = entries().filter(|entry| entry.waiting).count() as u8;
-        self.periodic_due = entries().map(|entry| entry.next_due).min().unwrap_or(NEVER);
+        let due = entries().map(|entry| entry.next_due).min();
+        self.periodic_due = due.map_or(NEVER, |due| due.max(self.look_from));
     }
 
     /// Sets or clears a reply.
@@ -175,7 +176,7 @@ impl Transmitter {
         if !self.queue.is_empty() {
             self.dropping = Some(reason);
         }
-        if self.mailboxes.iter().any(Option::is_some) {
+        if self.mailboxes.len() > 0 {
             traffic.abort();
         }
     }
@@ -187,12 +188,12 @@ impl Transmitter {
         now: u64,
         reason: TransmitFailure,
     ) {
-        for place in &mut self.mailboxes {
-            let Some((tag, _)) = *place else { continue };
-            if recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
-                self.failed = self.failed.wrapping_add(1);
-                *place = None;
+        while let Some((mailbox, tag)) = self.mailboxes.first() {
+            if !recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
+                return;
             }
+            self.failed = self.failed.wrapping_add(1);
+            self.mailboxes.take(mailbox);
         }
     }
 
@@ -209,7 +210,7 @@ impl Transmitter {
         self.clear_entries();
         self.queue.clear();
         self.unconfirmed.clear();
-        self.mailboxes = [None; MAILBOXES];
+        self.mailboxes = Mailboxes::new();
         self.dropping = None;
     }
 
@@ -240,14 +241,12 @@ impl Transmitter {
         self.service(traffic, recorder, now);
     }
 
-    /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::load_due`] may follow before
+    /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::prepare_head`] may follow before
     /// [`Self::record`], so that a busy bus need not wait for the record.
     pub fn collect(&mut self, traffic: &mut impl Traffic, reason: TransmitFailure) {
         while !self.unconfirmed.is_full() {
             let Some((mailbox, outcome)) = traffic.take_finished() else { break };
-            let Some((tag, frame)) = self.mailboxes.get_mut(mailbox as usize).and_then(Option::take) else {
-                continue;
-            };
+            let Some((tag, frame)) = self.mailboxes.take(mailbox) else { continue };
             let channel = self.channel;
             let failed = |reason| Event::TransmitFailed { channel, tag, reason };
             let event = match outcome {
@@ -266,38 +265,36 @@ impl Transmitter {
     /// Whether something other than the queue's frames is waiting, for [`Self::service`].
     pub fn has_more(&self, now: u64) -> bool {
         let waiting = self.replies_waiting > 0 || self.periodic_waiting > 0 || self.dropping.is_some();
-        waiting || self.next_periodic().is_some_and(|due| due <= now)
+        waiting || self.periodic_due <= now
     }
 
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
-    #[inline]
-    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
-        while let Some((mailbox, _)) = self.prepare_due(traffic, now, now) {
+    fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
+        while self.head_due() <= now
+            && let Some(mailbox) = self.prepare_head(traffic, now)
+        {
             traffic.request(mailbox);
             self.requested(mailbox);
         }
     }
 
-    /// Writes the queue's head to a mailbox if it is due `until` then, unless something else goes first. It is sent by
-    /// [`Traffic::request`], with [`Self::requested`] afterwards. Returns the mailbox and when it is due.
+    /// Writes the queue's head to a mailbox, unless something else goes first at this time. It is sent by [`Traffic::request`],
+    /// with [`Self::requested`] afterwards.
     #[inline]
-    pub fn prepare_due(&mut self, traffic: &mut impl Traffic, now: u64, until: u64) -> Option<(u8, u64)> {
-        let &Queued { ref frame, at, .. } = self.queue.front()?;
+    pub fn prepare_head(&mut self, traffic: &mut impl Traffic, at: u64) -> Option<u8> {
         // Whatever is in a mailbox must find room to be kept when it has finished.
-        let kept = self.unconfirmed.len() + self.mailboxes.iter().flatten().count();
-        if at > until || kept >= self.unconfirmed.capacity() || self.has_more(now.max(at)) {
+        let kept = self.unconfirmed.len() + self.mailboxes.len();
+        if kept >= self.unconfirmed.capacity() || self.has_more(at) {
             return None;
         }
-        Some((traffic.prepare(frame)?, at))
+        traffic.prepare(&self.queue.front()?.frame)
     }
 
     /// The queue's head is in this mailbox, and was requested.
     #[inline]
     pub fn requested(&mut self, mailbox: u8) {
-        if let (Some(place), Some(Queued { tag, frame, .. })) =
-            (self.mailboxes.get_mut(usize::from(mailbox)), self.queue.pop_front())
-        {
-            *place = Some((tag, frame));
+        if let Some(Queued { tag, frame, .. }) = self.queue.pop_front() {
+            self.mailboxes.put(mailbox, tag, frame);
         }
     }
 
@@ -332,7 +329,7 @@ impl Transmitter {
             }
             self.dropping = None;
         }
-        if self.next_periodic().is_some_and(|due| due <= now) {
+        if self.periodic_due <= now {
             self.start_due(recorder, now);
         }
         while self.replies_waiting > 0 {
@@ -348,33 +345,39 @@ impl Transmitter {
         self.load_due(traffic, now);
     }
 
-    /// When the queue's head is due, if it has a time and a mailbox is free: one that is due waits for a mailbox, not for time.
-    pub fn next_queued(&self) -> Option<u64> {
-        let head = self.queue.front().map(|queued| queued.at)?;
-        (head != 0 && self.mailboxes.iter().any(Option::is_none)).then_some(head)
+    /// When the queue's head is due, if there is one and a mailbox is free: one that is due waits for a mailbox, not for time. 0
+    /// if it has no time.
+    #[inline]
+    pub fn head_due(&self) -> u64 {
+        match self.queue.front() {
+            Some(head) if !self.mailboxes.are_full() => head.at,
+            _ => NEVER,
+        }
     }
 
-    /// When the periodic entries are to be looked at.
-    pub fn next_periodic(&self) -> Option<u64> {
-        (self.periodic_due != NEVER).then(|| self.periodic_due.max(self.look_from))
+    /// When the periodic entries are to be looked at; [`NEVER`] if there are none.
+    #[inline]
+    pub const fn periodic_due(&self) -> u64 {
+        self.periodic_due
     }
 
     /// The next time at which [`Self::service`] has something to do that no interrupt of the controller tells.
-    pub fn next_due(&self) -> Option<u64> {
+    #[inline]
+    pub fn next_due(&self) -> u64 {
         // What waits for room in the record queue is tried again every millisecond; an alarm would come again and again and
         // keep USB, which makes the room, from running.
         if !self.unconfirmed.is_empty() || self.dropping.is_some() {
-            return None;
+            return NEVER;
         }
-        self.next_queued().into_iter().chain(self.next_periodic()).min()
+        let head = self.head_due();
+        // Without a time it waits for something else.
+        self.periodic_due.min(if head == 0 { NEVER } else { head })
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {
         let Some(mailbox) = traffic.prepare(frame) else { return false };
         traffic.request(mailbox);
-        if let Some(place) = self.mailboxes.get_mut(mailbox as usize) {
-            *place = Some((tag, *frame));
-        }
+        self.mailboxes.put(mailbox, tag, *frame);
         true
     }
 

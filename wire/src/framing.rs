@@ -67,7 +67,7 @@ pub fn seal(message: &mut [u8], len: usize, out: &mut [u8]) -> Option<usize> {
     if out.len() < max_encoded_len(len) {
         return None;
     }
-    let encoded = cobs::encode(&message[..len + CRC_LEN], out);
+    let encoded = encode_cobs(&message[..len + CRC_LEN], out);
     out[encoded] = 0;
     Some(encoded + 1)
 }
@@ -82,6 +82,26 @@ pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], Framing
     let body = len.checked_sub(CRC_LEN).ok_or(FramingError::Short)?;
     let (message, crc) = out[..len].split_at(body);
     if CRC.checksum(message).to_le_bytes() == crc { Ok(message) } else { Err(FramingError::Crc) }
+}
+
+/// Encodes COBS in whole runs, into `out`, which is long enough: `cobs::encode` goes byte by byte, which costs the device a tenth of
+/// its time for USB.
+fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
+    const MAX_RUN: usize = 254;
+    let (mut rest, mut len) = (message, 0);
+    loop {
+        let most = rest.len().min(MAX_RUN);
+        let run = rest[..most].iter().position(|&byte| byte == 0).unwrap_or(most);
+        out[len] = run as u8 + 1;
+        out[len + 1..][..run].copy_from_slice(&rest[..run]);
+        len += 1 + run;
+        // A full run has no zero behind it; any other has one, or the end.
+        let taken = if run == MAX_RUN { run } else { run + 1 };
+        match rest.get(taken..) {
+            Some(behind) if run < MAX_RUN || !behind.is_empty() => rest = behind,
+            _ => return len,
+        }
+    }
 }
 
 /// Decodes COBS in whole runs: `cobs::decode` goes byte by byte, which costs the host a fifth of its decoding.
@@ -108,7 +128,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn cobs_decodes_what_the_crate_encodes(
+        fn cobs_is_the_crate_s_in_both_directions(
             // Few zeros, so that there are full runs; or many.
             message in prop_oneof![
                 proptest::collection::vec(0..=255u8, 0..600),
@@ -118,6 +138,9 @@ mod tests {
         ) {
             let mut encoded = [0; 1024];
             let encoded_len = cobs::encode(&message, &mut encoded);
+            let mut ours = [0; 1024];
+            let our_len = encode_cobs(&message, &mut ours);
+            prop_assert_eq!(&ours[..our_len], &encoded[..encoded_len]);
             let mut decoded = [0; 1024];
             let len = decode_cobs(&encoded[..encoded_len], &mut decoded).unwrap();
             prop_assert_eq!(&decoded[..len], &message[..]);

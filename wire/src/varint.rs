@@ -7,6 +7,10 @@ const MAX_U32: usize = 5;
 /// Reads a `u64`, with what follows it.
 #[inline]
 pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
+    // Most are short, and 64 bits are slow to shift on the device.
+    if let Some((value, rest)) = take_short(bytes) {
+        return Some((value.into(), rest));
+    }
     let mut value = 0;
     for (index, &byte) in bytes.iter().enumerate() {
         let bits = u64::from(byte & 0x7F);
@@ -23,9 +27,25 @@ pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
     None
 }
 
+/// Reads what takes at most four bytes.
+#[inline]
+fn take_short(bytes: &[u8]) -> Option<(u32, &[u8])> {
+    let mut value = 0;
+    for (index, &byte) in bytes.iter().enumerate().take(4) {
+        value |= u32::from(byte & 0x7F) << (7 * index);
+        if byte < 0x80 {
+            return Some((value, &bytes[index + 1..]));
+        }
+    }
+    None
+}
+
 /// Reads a `u32`, with what follows it.
 #[inline]
 pub(crate) fn take_u32(bytes: &[u8]) -> Option<(u32, &[u8])> {
+    if let Some(short) = take_short(bytes) {
+        return Some(short);
+    }
     let (value, rest) = take_u64(bytes)?;
     let is_short = bytes.len() - rest.len() <= MAX_U32;
     Some((u32::try_from(value).ok().filter(|_| is_short)?, rest))

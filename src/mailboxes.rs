@@ -1,0 +1,52 @@
+//! What is in a controller's transmit mailboxes.
+
+use cantap_wire::Frame;
+
+use crate::transmit::MAILBOXES;
+
+/// Frames by mailbox, with their tags. How many there are is asked far more often than it changes.
+pub struct Mailboxes {
+    places: [Option<(u32, Frame)>; MAILBOXES],
+    taken: usize,
+}
+
+impl Mailboxes {
+    /// All empty.
+    pub const fn new() -> Self {
+        Self { places: [None; MAILBOXES], taken: 0 }
+    }
+
+    /// How many hold a frame.
+    #[inline]
+    pub const fn len(&self) -> usize {
+        self.taken
+    }
+
+    /// Whether all hold a frame.
+    #[inline]
+    pub const fn are_full(&self) -> bool {
+        self.taken == MAILBOXES
+    }
+
+    /// A frame was written to an empty one.
+    #[inline]
+    pub fn put(&mut self, mailbox: u8, tag: u32, frame: Frame) {
+        if let Some(place) = self.places.get_mut(usize::from(mailbox)) {
+            self.taken += usize::from(place.is_none());
+            *place = Some((tag, frame));
+        }
+    }
+
+    /// Empties one; `None` if it was.
+    #[inline]
+    pub fn take(&mut self, mailbox: u8) -> Option<(u32, Frame)> {
+        let held = self.places.get_mut(usize::from(mailbox))?.take()?;
+        self.taken -= 1;
+        Some(held)
+    }
+
+    /// The first that holds a frame, with its tag.
+    pub fn first(&self) -> Option<(u8, u32)> {
+        (0..).zip(&self.places).find_map(|(mailbox, place)| place.map(|(tag, _)| (mailbox, tag)))
+    }
+}

@@ -1,6 +1,6 @@
 //! Bytes from the host, until a whole request or line is there.
 
-/// Room for bytes: six of the longest requests to send, and what a host may have under way by `docs/wire-protocol.md`.
+/// Room for bytes: six of the longest requests to send.
 const INBOX: usize = 4096;
 
 /// Received bytes in order.
@@ -45,6 +45,11 @@ impl Inbox {
         room.copy_from_slice(packet);
         self.end += packet.len();
         true
+    }
+
+    /// Bytes that there is room for.
+    pub const fn room(&self) -> usize {
+        INBOX - (self.end - self.start)
     }
 
     /// The first byte.

@@ -154,7 +154,11 @@ pub trait Port {
     fn write(&mut self, packet: &[u8]) -> bool;
     /// Takes one packet and returns its length.
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize>;
+    /// Makes the host wait with what it sends, or no longer. What is on its way still comes: at most [`ON_ITS_WAY`] packets.
+    fn hold(&mut self, hold: bool);
 }
 
+/// Packets that may still come from a host that was told to wait.
+pub const ON_ITS_WAY: usize = 3;
 /// Largest packet of a full-speed bulk endpoint, in bytes (USB 2.0, 5.8.3).
 pub const PACKET: usize = 64;

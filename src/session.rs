@@ -12,7 +12,7 @@ use crate::answers::Answers;
 use crate::command::{Commands, Identity, Step, Work, send};
 use crate::inbox::Inbox;
 use crate::outbox::Outbox;
-use crate::ports::{Board, PACKET, Port};
+use crate::ports::{Board, ON_ITS_WAY, PACKET, Port};
 use crate::queue::Consumer;
 use crate::sender::Sender;
 use crate::slcan::{Answer, Slcan};
@@ -97,11 +97,13 @@ impl<'q, const N: usize> Session<'q, N> {
                 break;
             }
         }
+        self.hold(port);
         self.outbox.end(port);
     }
 
     /// The host is gone: the channels leave the bus, and nothing of it remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
+        port.hold(false);
         while port.read(&mut self.packet).is_some() {}
         if self.is_active() {
             self.language = Language::Unknown;
@@ -116,15 +118,20 @@ impl<'q, const N: usize> Session<'q, N> {
         self.look_after_work(board);
     }
 
-    /// Takes every packet that is there: one left in the USB peripheral would hold up the control
-    /// pipe behind it. What finds no room is dropped and counted; a host that waits for responses
-    /// never gets there.
+    /// Takes every packet that is there: one left in the USB peripheral would hold up the control pipe behind it. So the host is
+    /// made to wait before there is no room for what is on its way. What finds none all the same is dropped and counted.
     fn read(&mut self, port: &mut impl Port) {
-        while let Some(len) = port.read(&mut self.packet) {
+        loop {
+            self.hold(port);
+            let Some(len) = port.read(&mut self.packet) else { break };
             if !self.inbox.push(&self.packet[..len]) {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
             }
         }
+    }
+
+    fn hold(&self, port: &mut impl Port) {
+        port.hold(self.inbox.room() < ON_ITS_WAY * PACKET);
     }
 
     fn begin(&mut self, work: Work, origin: Origin, board: &mut impl Board<'q, N>) {
@@ -260,6 +267,14 @@ impl<'q, const N: usize> Session<'q, N> {
         // The next program speaks the native language: half a line of the last one must not swallow its greeting.
         if self.inbox.drop_unfinished(b'\r') {
             return true;
+        }
+        // Terminal programs end lines with CR LF.
+        if self.inbox.first() == Some(b'\n') {
+            self.inbox.skip(1);
+            return true;
+        }
+        if self.slcan.must_wait(self.inbox.first(), board) {
+            return false;
         }
         let mut line = heapless::Vec::<u8, { Slcan::MAX_LINE }>::new();
         let Some(taken) =

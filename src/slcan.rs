@@ -26,6 +26,8 @@ const SJA1000_HZ: u32 = 8_000_000;
 const STAMP_WRAP_MS: u64 = 60_000;
 /// Longest line that a frame makes: `T`, 8 identifier, 1 DLC, 16 data, 8 stamp, CR.
 const MAX_FRAME_LINE: usize = 1 + 8 + 1 + 16 + 8 + 1;
+/// A frame waits so long for room in a queue from which nothing leaves: no frame at 10 kbit/s and above takes longer.
+const FULL_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Lines for one filling of the outbox.
 const MAX_LINES_BYTES: usize = 1024;
 
@@ -80,6 +82,8 @@ pub struct Slcan {
     flags: u8,
     tag: u32,
     running_ticks: u64,
+    /// Since when the transmit queue has been full.
+    full_since: Option<u32>,
 }
 
 impl Slcan {
@@ -101,6 +105,7 @@ impl Slcan {
             flags: 0,
             tag: 0,
             running_ticks: 0,
+            full_since: None,
         }
     }
 
@@ -112,6 +117,27 @@ impl Slcan {
     /// Whether an answer waits to be sent.
     pub const fn is_answering(&self) -> bool {
         self.answer.is_some()
+    }
+
+    /// Whether a line that begins so must wait: a frame to be sent, for room in the queue. Few programs look at the answers, and a
+    /// refused frame would be lost to them. When nothing has left for a while, it is refused all the same.
+    pub fn must_wait<'q, const N: usize>(
+        &mut self,
+        first: Option<u8>,
+        board: &mut impl Board<'q, N>,
+    ) -> bool {
+        if !matches!(first, Some(b't' | b'T' | b'r' | b'R')) {
+            return false;
+        }
+        let has_room = board.with_capture(|capture, _, _| {
+            capture.config(CHANNEL).is_none() || capture.transmitter(CHANNEL).free() > 0
+        });
+        if has_room {
+            self.full_since = None;
+            return false;
+        }
+        let now = board.now();
+        now.wrapping_sub(*self.full_since.get_or_insert(now)) < FULL_TICKS
     }
 
     /// Answers the last line.
@@ -126,7 +152,7 @@ impl Slcan {
         commands: &mut Commands,
         board: &mut impl Board<'q, N>,
     ) -> Option<Work> {
-        // Terminal programs end lines with CR LF; empty lines are answered, since hosts send them to synchronise.
+        // Empty lines are answered, since hosts send them to synchronise.
         let line = line.trim_ascii();
         let Some((&letter, parameters)) = line.split_first() else {
             self.answer = Some(Answer::Ok);

@@ -4,6 +4,7 @@ mod fakes;
 
 use cantap_firmware::filters::Shape;
 use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::transmit::{MAILBOXES, TX_QUEUE};
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::Mode;
 use cantap_wire::record::{BusErrorKind, ErrorState};
@@ -122,13 +123,46 @@ fn frames_are_sent_and_their_order_kept() {
 }
 
 #[test]
-fn a_full_transmit_queue_is_refused_and_flagged() {
+fn a_full_transmit_queue_is_waited_for_and_then_refused_and_flagged() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
     converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
     let taken = (0..400).take_while(|_| say(&mut bench, "t1230") == "z\r").count();
-    assert_eq!(taken, cantap_firmware::transmit::TX_QUEUE + cantap_firmware::transmit::MAILBOXES);
-    converse(&mut bench, &[("F", "F02\r"), ("F", "F00\r")]);
+    assert_eq!(taken, TX_QUEUE + MAILBOXES);
+    // One leaves, and the line that waited has room; the next finds none for too long.
+    bench.send_one(CAN1);
+    converse(&mut bench, &[("t1231AA", "z\r")]);
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert!(bench.port.from_device.ends_with(b"\x07"));
+    // So does each after it, but none waits as long again; and whatever else is asked is answered.
+    converse(
+        &mut bench,
+        &[("t1230", "\x07"), ("F", "F02\r"), ("t1230", "\x07"), ("F", "F02\r"), ("F", "F00\r")],
+    );
+    bench.send_one(CAN1);
+    converse(&mut bench, &[("t1230", "z\r")]);
+}
+
+/// A program that sends as fast as it can write, as python-can does, and reads the answers later.
+#[test]
+fn every_line_of_a_burst_is_answered_and_every_frame_sent() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S8", "\r"), ("O", "\r")]);
+    let before = bench.port.from_device.len();
+    let burst: Vec<u8> =
+        (0..2000).flat_map(|n| format!("T{n:08X}81122334455667788\r").into_bytes()).collect();
+    bench.say(&burst);
+    let mut sent = Vec::new();
+    for _ in 0..2500 {
+        bench.millisecond();
+        sent.extend(bench.send_one(CAN1).map(|frame| frame.id().raw()));
+    }
+    assert_eq!(sent, (0..2000).collect::<Vec<_>>());
+    assert_eq!(bench.port.from_device[before..], *"Z\r".repeat(2000).as_bytes());
+    converse(&mut bench, &[("F", "F00\r")]);
 }
 
 #[test]

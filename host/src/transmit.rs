@@ -14,8 +14,7 @@ use cantap_wire::{CHANNELS, Channel, Command, Frame};
 use crate::device::{Pending, Transmission};
 use crate::{Device, DeviceError};
 
-/// Requests under way: with 20 frames each, more than both buses take in a USB round trip, and no more bytes than a device has
-/// room for.
+/// Requests under way: with 20 frames each, more than both buses take in a USB round trip.
 const REQUESTS: usize = 6;
 /// How long to wait for a confirmation before looking whether to go on.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

@@ -23,6 +23,8 @@ const MOST_READS: u32 = 1_000;
 pub struct UsbPort {
     device: UsbDevice<'static, UsbBusType>,
     class: CdcAcmClass<'static, UsbBusType>,
+    /// The host was told to wait.
+    held: bool,
 }
 
 /// What must live as long as the program.
@@ -57,7 +59,7 @@ impl UsbPort {
             // Cannot fail: one language, and less than the 500 mA that a device may ask for.
             .expect("the descriptors are within USB's limits")
             .build();
-        Self { device, class }
+        Self { device, class, held: false }
     }
 
     /// Looks after the bus: resets, control requests, packets that have come or gone. Handles one of them at a time;
@@ -68,10 +70,20 @@ impl UsbPort {
         if enumerated {
             release_in_endpoints();
         }
+        if self.held {
+            // The driver takes NAK back at the end of each packet.
+            self.refuse_packets(true);
+        }
     }
 }
 
 impl UsbPort {
+    /// Answers what the host sends with NAK from here on, or no longer (RM0090, OTG_FS_DOEPCTLx, SNAK and CNAK).
+    fn refuse_packets(&self, refuse: bool) {
+        let endpoint = self.class.read_ep().address().index();
+        device().doep(endpoint - 1).ctl().modify(|_, w| w.snak().bit(refuse).cnak().bit(!refuse));
+    }
+
     /// Whether the data endpoint is in use.
     fn sends(&self) -> bool {
         let endpoint = self.class.write_ep().address().index();
@@ -96,6 +108,13 @@ impl Port for UsbPort {
 
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
         self.class.read_packet(packet).ok()
+    }
+
+    fn hold(&mut self, hold: bool) {
+        if hold != self.held {
+            self.held = hold;
+            self.refuse_packets(hold);
+        }
     }
 }
 

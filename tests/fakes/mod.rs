@@ -235,6 +235,8 @@ pub struct FakePort {
     pub to_device: VecDeque<Vec<u8>>,
     pub from_device: Vec<u8>,
     pub packets: Vec<usize>,
+    /// The host was told to wait.
+    pub held: bool,
     /// Packets that the host still takes.
     pub takes: usize,
 }
@@ -256,9 +258,13 @@ impl Port for FakePort {
     }
 
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
-        let bytes = self.to_device.pop_front()?;
+        let bytes = if self.held { None } else { self.to_device.pop_front() }?;
         packet[..bytes.len()].copy_from_slice(&bytes);
         Some(bytes.len())
+    }
+
+    fn hold(&mut self, hold: bool) {
+        self.held = hold;
     }
 }
 

@@ -178,11 +178,13 @@ pub struct VirtualPort {
     pub open: Arc<AtomicBool>,
     /// Packets that may still be sent now.
     credit: u32,
+    /// The host was told to wait.
+    held: bool,
 }
 
 impl VirtualPort {
     pub const fn new(from_host: PipeReader, to_host: PipeWriter, open: Arc<AtomicBool>) -> Self {
-        Self { from_host, to_host, open, credit: 0 }
+        Self { from_host, to_host, open, credit: 0, held: false }
     }
 
     /// A share of a millisecond has passed: so many of `parts`.
@@ -206,7 +208,11 @@ impl Port for VirtualPort {
     }
 
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
-        let len = self.from_host.take(packet);
+        let len = if self.held { 0 } else { self.from_host.take(packet) };
         (len > 0).then_some(len)
+    }
+
+    fn hold(&mut self, hold: bool) {
+        self.held = hold;
     }
 }

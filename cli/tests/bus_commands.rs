@@ -70,11 +70,21 @@ fn a_reply_follows_what_its_filter_accepts() {
 fn faulty_lines_are_refused_before_anything_is_sent() {
     for (line, code, part) in [
         ("send -d virtual can2 123#", 2, "can0"),
-        ("send -d virtual can0 123", 1, "123#DEADBEEF"),
-        ("send -d virtual can0 800#", 1, "7FF"),
+        ("send -d virtual can0 123", 2, "123#DEADBEEF"),
+        ("send -d virtual can0 123#GG", 2, "'123#GG' is no frame"),
+        ("send -d virtual can0 800#", 2, "7FF"),
         ("send -d virtual can0 123# --counter 0", 2, "--period"),
-        ("send -d virtual can0 123#00 --period 1us", 1, "period"),
-        ("send -d virtual can0 123#00 --period 10ms --counter 1", 1, "modifier"),
+        ("send -d virtual can0 123#00 --period 46us", 2, "46µs is too short: no frame is shorter than 47µs"),
+        ("send -d virtual can0 123#00 --period 10m", 2, "too long; give at most 357s"),
+        (
+            "send -d virtual can0 123#00 --period 1ms --counter 1",
+            2,
+            "cantap: a modifier changes byte 1 of '123#00'",
+        ),
+        ("send -d virtual can0 123#00 --period 1ms --counter 0.4:5", 2, "cantap: a counter of 5 bits"),
+        ("send -d virtual can0 123#00 --on-rx 000:000 --counter 0", 2, "--on-rx"),
+        ("send -d virtual can0 123#00 --reply --random 0", 2, "--reply"),
+        ("send -d virtual can0 123#00 --on-rx xyz:7FF", 2, "hexadecimal"),
         ("send -d virtual can0 123#00 -b 999999", 1, "947368"),
         ("send -d virtual can0 123#00 -b 500k --triple", 1, "samples each bit once"),
         ("send -d /dev/null/nothing can0 123#", 1, "cantap list"),
@@ -323,7 +333,16 @@ fn a_replay_takes_canplayers_options() {
     assert!(times[4] - times[0] < 5_000, "{times:?}");
     let (_, times) = play(&format!("{} -s 1 -g 30", path.display()));
     assert!(times.windows(2).all(|pair| pair[1] - pair[0] >= 29_900), "{times:?}");
-    for (options, part) in [("-l 0", "from 1, or i"), ("-n 0", "0"), ("stdout=can0", "can0 or 1")] {
+    for (options, part) in [
+        ("-l 0", "from 1, or i"),
+        ("-n 0", "0"),
+        ("stdout=can0", "can0 or 1"),
+        // Without times there is nothing to hold apart, and canplayer sends a frame once.
+        ("-t -g 50", "--gap"),
+        ("-t --speed 2", "--speed"),
+        ("-t -s 1", "--skip"),
+        ("can0=can0 can1=can0", "can0 is mapped twice"),
+    ] {
         let (code, _, err) = cantap(&format!("replay -d virtual {} {options}", path.display()));
         assert!(code == Some(2) && err.contains(part), "{options}: {err}");
     }
@@ -344,7 +363,7 @@ fn made_up_frames_take_cangens_options() {
     for (options, code, part) in [
         ("-f", 1, "classical CAN"),
         ("-E", 1, "classical CAN"),
-        ("-L 9", 1, "-8 allows"),
+        ("-L 9", 2, "-8 allows"),
         ("-L 16", 2, "a length from 0 to 8"),
         ("-I 20000000", 2, "up to 1FFFFFFF"),
         ("-D 112233445566778899", 2, "up to 8 bytes"),

@@ -12,6 +12,7 @@ pub mod filter;
 #[cfg(feature = "formats")]
 pub mod formats;
 pub mod hw_filter;
+pub mod periodic;
 pub mod playback;
 #[cfg(feature = "plot")]
 pub mod plot;

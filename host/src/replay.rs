@@ -74,7 +74,8 @@ impl Timetable {
         f64::from(bits) * 1e9 / f64::from(self.bitrates_bps[channel.index()].max(1))
     }
 
-    /// When a frame that ended at `end_ns` in the trace begins, and when it will end, in ticks.
+    /// When a frame that ended at `end_ns` in the trace begins, and when it will end, in ticks. A begin before the device's
+    /// start is 0, an end before it wraps.
     pub fn next(&mut self, end_ns: i64, channel: Channel, frame: &Frame) -> (u64, u64) {
         let length_ns = self.length_ns(channel, frame);
         let begin_ns = end_ns - length_ns.round() as i64;
@@ -97,8 +98,10 @@ impl Timetable {
             if frames == 0 || frames >= self.pace.burst { (at_ns, 1) } else { (burst_at_ns, frames + 1) };
         self.last = Some((begin_ns, at_ns));
         // Whole ticks first: a float does not hold a long uptime's nanoseconds.
-        let ticks = |ns: f64| self.first_ticks.saturating_add_signed((ns / self.tick_ns).round() as i64);
-        (ticks(at_ns), ticks(at_ns + length_ns))
+        let ticks = |ns: f64| (ns / self.tick_ns).round() as i64;
+        // A trace out of order may plan an end before the device's start: what is told of lateness counts from there, too.
+        let end = self.first_ticks.wrapping_add_signed(ticks(at_ns + length_ns));
+        (self.first_ticks.saturating_add_signed(ticks(at_ns)), end)
     }
 }
 
@@ -219,6 +222,7 @@ impl<'d> Replay<'d> {
     }
 
     fn compare(&mut self, ticks: u64, planned: u64) {
+        // Either may be the greater one; a planned end may lie before zero.
         let late = ticks.wrapping_sub(planned) as i64;
         let first = *self.first_late.get_or_insert(late);
         let off_us = (late - first) as f64 * 1e6 / f64::from(self.tick_hz);
@@ -236,6 +240,8 @@ impl<'d> Replay<'d> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    #[cfg(feature = "virtual")]
+    use cantap_wire::message::{ChannelConfig, Mode};
 
     const CAN1: Channel = Channel::Can1;
 
@@ -272,5 +278,36 @@ mod tests {
         assert_eq!(begins(Pace { shortest_gap, ..Pace::default() }), [0, 60_000, 180_000]);
         // The second belongs to the first one's burst; the third is late by itself.
         assert_eq!(begins(Pace { shortest_gap, burst: 2, ..Pace::default() }), [0, 12_000, 132_000]);
+    }
+
+    /// The device may have started a moment ago: what was planned long before that is late by all of it.
+    #[test]
+    fn an_end_planned_before_the_devices_start_is_not_clipped() {
+        let mut table = table(Pace::default());
+        let first = table.next(1_000_000_000, CAN1, &frame("555#"));
+        let second = table.next(500_000_000, CAN1, &frame("555#"));
+        assert_eq!(second.0, 0);
+        assert_eq!(first.1.wrapping_sub(second.1), 6_000_000);
+    }
+
+    #[cfg(feature = "virtual")]
+    #[test]
+    fn lateness_of_a_trace_out_of_order_is_measured_on_the_traces_own_schedule() {
+        let device = Device::open(&"virtual:load=0".parse().unwrap()).unwrap();
+        let config = ChannelConfig {
+            mode: Mode::Normal,
+            ..ChannelConfig::listen_only(device.timing(500_000).unwrap())
+        };
+        device.open_channel(CAN1, Some(config)).unwrap();
+        let mut replay = Replay::new(&device, Pace::default(), [500_000; 2]).unwrap();
+        for end_ms in [1_000, 500, 1_100, 1_050, 1_200] {
+            assert!(replay.push(end_ms * 1_000_000, CAN1, frame("123#11"), |_| true).unwrap());
+        }
+        assert!(replay.finish(|since| since < Duration::from_secs(10)).unwrap());
+        assert!(replay.take_ended().iter().all(|end| end.result.is_ok()));
+        let Accuracy { frames, early_us, late_us } = replay.accuracy();
+        // The second leaves behind the first: half a second and a frame (57 bits and the intermission) late.
+        assert_eq!(frames, 5);
+        assert!((500_100.0..500_140.0).contains(&late_us) && early_us < 1.0, "{late_us} {early_us}");
     }
 }

@@ -12,6 +12,7 @@ use cantap::{Address, Channel, Device, Frame, Id};
 use crate::channel_args::{self, ChannelArgs};
 use crate::interrupt;
 use crate::sending::{self, BusWatch, Tally};
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -202,7 +203,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         bail!("the device is a classical CAN controller, without CAN FD; leave -f and -E away");
     }
     if matches!(args.length, Some(Values::Fixed(9..))) && !args.raw_dlc {
-        bail!("a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight");
+        let reason = "a frame carries 0 to 8 bytes; -8 allows lengths up to 15, which say eight";
+        return Err(wrong(reason));
     }
     interrupt::watch()?;
     let device = Device::open(&args.device)?;

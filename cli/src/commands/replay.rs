@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, Error, bail};
+use anyhow::{Context, bail};
 use cantap::device::Transmission;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
@@ -15,6 +15,7 @@ use cantap::{Address, Channel, Device, TraceEvent};
 use crate::channel_args::{self, ChannelArgs};
 use crate::input::ReadArgs;
 use crate::sending::{self, BusWatch, Tally};
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// The command line.
@@ -51,8 +52,8 @@ pub struct Args {
     /// Least time between two frames, in milliseconds.
     #[arg(short, long, value_name = "MS", default_value_t = 0.0, value_parser = milliseconds)]
     gap: f64,
-    /// Ignore the trace's times: as fast as the bus takes it.
-    #[arg(short = 't', long)]
+    /// Ignore the trace's times: as fast as the bus takes it, so that --gap, --skip and --speed have no meaning.
+    #[arg(short = 't', long, conflicts_with_all = ["gap", "skip", "speed"])]
     ignore_times: bool,
     /// Play faster (2) or slower (0.5).
     #[arg(long, default_value_t = 1.0, value_parser = speed)]
@@ -239,13 +240,23 @@ impl Args {
             (Some(from), first) => {
                 // With -I the first word is a mapping too.
                 if let Some(word) = first {
-                    mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(Error::msg)?);
+                    mapping.insert(0, self::mapping(&word.to_string_lossy()).map_err(wrong)?);
                 }
                 from.clone()
             }
             (None, Some(input)) => input.clone(),
             (None, None) => PathBuf::from("-"),
         };
+        let repeated = mapping
+            .iter()
+            .enumerate()
+            .find(|(at, (_, from))| mapping[..*at].iter().any(|(_, earlier)| earlier == from));
+        if let Some((_, (_, from))) = repeated {
+            let interface = from - 1;
+            return Err(wrong(format!(
+                "can{interface} is mapped twice, and each frame is sent once; give one TO=can{interface}"
+            )));
+        }
         Ok(Source { input, mapping })
     }
 

@@ -5,18 +5,21 @@ mod modifiers;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use cantap::filter::Filter;
+use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
 use cantap::wire::message::{
     DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, TRIGGER_TAG, Trigger,
 };
 use cantap::{Address, Channel, Device, Frame, Id, hw_filter, signals};
+use modifiers::Modifiers;
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::databases::DatabaseArgs;
 use crate::rescue::Rescue;
 use crate::sending::{self, GIVE_UP_AFTER, Tally};
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// The command line.
@@ -71,11 +74,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything that can be wrong on the line is found before anything is sent.
     let frames = args.frames()?;
     let triggers = args.triggers(&frames)?;
-    let periodic = args
-        .period
-        .map(|period| (period, args.modifiers.list()))
-        .map(|(period, list)| list.map(|list| (period, list)))
-        .transpose()?;
+    let periodic = args.periodic(&frames)?;
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
@@ -94,7 +93,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             args.watch(stream, TRIGGER_TAG, &mut tally, args.count.map(u64::from), &mut rescue)?
         }
         (None, Some((period, modifiers))) => {
-            let ticks = period.as_secs_f64() * f64::from(device.hello().tick_hz);
+            let period_ticks = periodic::period_ticks(period, device.hello().tick_hz)
+                .map_err(|error| wrong(error.to_string()))?;
             let slots = device.hello().periodic_slots;
             if frames.len() > usize::from(slots) {
                 bail!("the device keeps {slots} periodic frames and these are {}; give fewer", frames.len());
@@ -103,14 +103,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             for (slot, frame) in (0..).zip(&frames) {
                 let entry = Periodic {
                     frame: *frame,
-                    // Too long saturates, and the device refuses it.
-                    period_ticks: ticks.round() as u32,
+                    period_ticks,
                     count: args.count.unwrap_or(0),
                     modifiers: modifiers.clone(),
                 };
-                device
-                    .set_periodic(args.channel, slot, Some(entry))
-                    .with_context(|| format!("--period {period:?}"))?;
+                device.set_periodic(args.channel, slot, Some(entry))?;
             }
             let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
             args.watch(stream, DEVICE_TAG, &mut tally, wanted, &mut rescue)?
@@ -130,10 +127,24 @@ impl Args {
             if text.contains(':') && !text.contains('#') {
                 Ok(signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
-                text.parse().with_context(|| format!("'{text}' is no frame"))
+                let frame = text.parse::<Frame>();
+                Ok(frame.map_err(|error| wrong(format!("'{text}' is no frame: {error}")))?)
             }
         };
         self.frames.iter().map(frame).collect()
+    }
+
+    /// The period and what changes each time, if frames are to be sent periodically.
+    fn periodic(&self, frames: &[Frame]) -> anyhow::Result<Option<(Duration, Modifiers)>> {
+        let Some(period) = self.period else { return Ok(None) };
+        if period < SHORTEST_PERIOD {
+            return Err(wrong(BadPeriodic::TooShort { period }.to_string()));
+        }
+        let modifiers = self.modifiers.list()?;
+        for frame in frames {
+            periodic::check_modifiers(frame, &modifiers).map_err(|error| wrong(error.to_string()))?;
+        }
+        Ok(Some((period, modifiers)))
     }
 
     /// The replies, if replies are wanted: for each frame one for each hardware filter.
@@ -151,7 +162,7 @@ impl Args {
         let filters = if let Ok(id) = text.parse::<Id>() {
             vec![exactly(id, FrameKind::Any)]
         } else {
-            let filter: Filter = text.parse()?;
+            let filter = text.parse::<Filter>().map_err(|error| wrong(error.to_string()))?;
             let compiled = hw_filter::compile(&[filter], self.channel);
             if let Some(remainder) = compiled.remainder {
                 bail!("'{text}' cannot start a reply: {remainder}, which is too late for it");

@@ -186,7 +186,7 @@ fn sentence(refusal: Refusal) -> String {
             "a transmission's tag is reserved for the device; use one below FFFF0000 hexadecimal"
         }
         Refusal::BadEntry => {
-            "a period is zero or too long, or a modifier lies outside the frame's data; change it"
+            "a period is too short or too long, or a modifier lies outside the frame's data; change it"
         }
         Refusal::BadSlot => "it has no such table entry; `cantap info` shows how many there are",
         Refusal::ChannelOpen => "the channel is open; close it first",

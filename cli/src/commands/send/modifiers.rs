@@ -1,32 +1,36 @@
 //! What changes in a periodic frame each time: counters, random bytes, checksums.
 
-use anyhow::bail;
 use cantap::wire::message::{Checksum, MAX_MODIFIERS, Modifier};
+
+use crate::wrong::wrong;
 
 /// The modifiers; applied in this order, so that a checksum covers the others.
 #[derive(clap::Args)]
 pub struct ModifierArgs {
     /// Count up in a byte of the data (from 0), or in some of its bits: BYTE or BYTE.LOWBIT:BITS, such as 7.0:4.
-    #[arg(long, value_name = "BYTE[.BIT:BITS]", value_parser = counter, requires = "period")]
+    #[arg(long, value_name = "BYTE[.BIT:BITS]", value_parser = counter, requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     counter: Vec<Modifier>,
     /// A new random value in a byte.
-    #[arg(long, value_name = "BYTE", requires = "period")]
+    #[arg(long, value_name = "BYTE", requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     random: Vec<u8>,
     /// A checksum over the other bytes in a byte: xor, sum, or crc8 (SAE-J1850).
-    #[arg(long, value_name = "BYTE:KIND", value_parser = checksum, requires = "period")]
+    #[arg(long, value_name = "BYTE:KIND", value_parser = checksum, requires = "period", conflicts_with_all = ["on_rx", "reply"])]
     checksum: Vec<Modifier>,
 }
 
+/// What changes in a frame.
+pub type Modifiers = heapless::Vec<Modifier, MAX_MODIFIERS>;
+
 impl ModifierArgs {
     /// All of them.
-    pub fn list(&self) -> anyhow::Result<heapless::Vec<Modifier, MAX_MODIFIERS>> {
+    pub fn list(&self) -> anyhow::Result<Modifiers> {
         let random = self.random.iter().map(|byte| Modifier::Random { byte: *byte });
-        let mut list = heapless::Vec::new();
+        let mut list = Modifiers::new();
         for modifier in self.counter.iter().copied().chain(random).chain(self.checksum.iter().copied()) {
             if list.push(modifier).is_err() {
-                bail!(
+                return Err(wrong(format!(
                     "a frame takes {MAX_MODIFIERS} modifiers; give fewer of --counter, --random, --checksum"
-                );
+                )));
             }
         }
         Ok(list)

@@ -31,6 +31,7 @@ mod rescue;
 mod sending;
 mod timing_args;
 mod trigger_args;
+mod words;
 mod wrong;
 
 use std::process::ExitCode;

@@ -89,6 +89,29 @@ fn context_is_shown_as_grep_does() {
 }
 
 #[test]
+fn what_is_no_frame_is_told_in_words() {
+    let table = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("events.csv");
+    let events = ["bus-error bit-recessive", "state passive", "transmit-failed arbitration-lost tag=1"];
+    let rows = events.map(|event| format!("1.0,1,,event,,,,{event}\n"));
+    let head = "time,channel,direction,type,id,dlc,data,event";
+    std::fs::write(&table, format!("{head}\n{}1.0,1,Rx,data,123,1,11,\n", rows.concat())).unwrap();
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let Output { stdout, .. } =
+        command.arg("search").arg(&table).args(["id == 0x123", "-B", "9"]).output().unwrap();
+    let found = String::from_utf8(stdout).unwrap();
+    let words: Vec<&str> = found.lines().map(|line| line.split_once("can0 ").unwrap().1).collect();
+    assert_eq!(
+        words,
+        [
+            "bus error: bit (recessive sent)",
+            "controller: error passive",
+            "not sent: arbitration lost",
+            "123#11"
+        ]
+    );
+}
+
+#[test]
 fn finding_nothing_ends_with_1_and_a_bad_condition_with_2_and_is_marked() {
     assert_eq!(
         cantap("nothing", &["search", "a.log", "--id", "7FF"]),

@@ -17,6 +17,7 @@ use crate::databases::DatabaseArgs;
 use crate::exit;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
+use crate::words::{error_name, failure_name, state_name};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -232,12 +233,12 @@ impl Sink {
 fn describe(event: &TraceEvent) -> String {
     match event {
         TraceEvent::Frame { frame, .. } => frame.to_string(),
-        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {kind:?}"),
+        TraceEvent::BusError { kind: Some(kind), .. } => format!("bus error: {}", error_name(*kind)),
         TraceEvent::BusError { kind: None, .. } => "bus error".to_owned(),
         TraceEvent::ErrorsSuppressed { count } => format!("{count} more bus errors"),
-        TraceEvent::State { state, .. } => format!("controller: {state:?}"),
+        TraceEvent::State { state, .. } => format!("controller: {}", state_name(*state)),
         TraceEvent::Lost { count, at_least: true, .. } => format!("at least {count} frames lost"),
         TraceEvent::Lost { count, .. } => format!("{count} frames lost"),
-        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {reason:?}"),
+        TraceEvent::TransmitFailed { reason, .. } => format!("not sent: {}", failure_name(*reason)),
     }
 }

@@ -10,7 +10,7 @@ use ratatui::widgets::Paragraph;
 use super::super::app::App;
 use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
-use super::trace::{error_name, state_name};
+use crate::words::{error_name, state_name};
 
 /// Columns of the gauge on a narrow and on a wide screen.
 const GAUGE_COLUMNS: [usize; 2] = [12, 40];

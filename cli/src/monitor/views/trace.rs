@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
+use cantap::wire::record::{ErrorState, LossStage};
 use cantap::{TraceEvent, TraceRecord};
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -13,6 +13,7 @@ use ratatui::widgets::Paragraph;
 use super::super::app::{App, TimeMode};
 use super::super::model::Model;
 use super::super::theme::Theme;
+use crate::words::{error_name, failure_name, state_name};
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
@@ -140,7 +141,9 @@ pub fn event_text(event: &TraceEvent) -> String {
         TraceEvent::Lost { stage, count, at_least } => {
             format!("L {} frames lost {}", lost(count, at_least), stage.map_or("somewhere", stage_name))
         }
-        TraceEvent::TransmitFailed { tag, reason } => format!("F frame {tag} not sent: {reason:?}"),
+        TraceEvent::TransmitFailed { tag, reason } => {
+            format!("F frame {tag} not sent: {}", failure_name(reason))
+        }
     }
 }
 
@@ -160,28 +163,6 @@ fn lost(count: u32, at_least: bool) -> String {
         (0, true) => "an unknown number of".to_owned(),
         (count, true) => format!("at least {count}"),
         (count, false) => count.to_string(),
-    }
-}
-
-/// A kind of error in the words of the field.
-pub fn error_name(kind: BusErrorKind) -> &'static str {
-    match kind {
-        BusErrorKind::Stuff => "stuff",
-        BusErrorKind::Form => "form",
-        BusErrorKind::Acknowledgment => "acknowledgment",
-        BusErrorKind::BitRecessive => "bit (recessive sent)",
-        BusErrorKind::BitDominant => "bit (dominant sent)",
-        BusErrorKind::Crc => "CRC",
-    }
-}
-
-/// A state in the words of the field.
-pub fn state_name(state: ErrorState) -> &'static str {
-    match state {
-        ErrorState::Active => "error active",
-        ErrorState::Warning => "error warning",
-        ErrorState::Passive => "error passive",
-        ErrorState::BusOff => "bus-off",
     }
 }
 

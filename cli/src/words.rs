@@ -1,0 +1,37 @@
+//! What devices report, in the words of the field.
+
+use cantap::wire::record::{BusErrorKind, ErrorState, TransmitFailure};
+
+/// A kind of error in the words of the field.
+pub fn error_name(kind: BusErrorKind) -> &'static str {
+    match kind {
+        BusErrorKind::Stuff => "stuff",
+        BusErrorKind::Form => "form",
+        BusErrorKind::Acknowledgment => "acknowledgment",
+        BusErrorKind::BitRecessive => "bit (recessive sent)",
+        BusErrorKind::BitDominant => "bit (dominant sent)",
+        BusErrorKind::Crc => "CRC",
+    }
+}
+
+/// A state in the words of the field.
+pub fn state_name(state: ErrorState) -> &'static str {
+    match state {
+        ErrorState::Active => "error active",
+        ErrorState::Warning => "error warning",
+        ErrorState::Passive => "error passive",
+        ErrorState::BusOff => "bus-off",
+    }
+}
+
+/// Why a frame was not sent.
+pub fn failure_name(reason: TransmitFailure) -> &'static str {
+    match reason {
+        TransmitFailure::ArbitrationLost => "arbitration lost",
+        TransmitFailure::BusError => "bus error",
+        TransmitFailure::Aborted => "aborted",
+        TransmitFailure::Closed => "channel closed",
+        TransmitFailure::BusOff => "bus-off",
+        TransmitFailure::Overtaken => "its next period came first",
+    }
+}

@@ -64,17 +64,21 @@ impl TimingArgs {
         self.bitrates = rates;
     }
 
+    /// Refuses bit rates of channels that no device has.
+    pub fn check_channels(&self) -> anyhow::Result<()> {
+        let is_there = |number| Channel::ALL.iter().any(|channel| channel.number() == number);
+        let named = self.bitrates.iter().filter_map(|rate| rate.channel).find(|number| !is_there(*number));
+        named.map_or(Ok(()), |number| {
+            Err(wrong(format!(
+                "a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k"
+            )))
+        })
+    }
+
     /// What was asked for on a channel, if anything was.
     pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
-        let is_there = |number| Channel::ALL.iter().any(|channel| channel.number() == number);
-        if let Some(number) =
-            self.bitrates.iter().filter_map(|rate| rate.channel).find(|number| !is_there(*number))
-        {
-            return Err(wrong(format!(
-                "a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k"
-            )));
-        }
+        self.check_channels()?;
         if let Some(timing) = self.segments.or(self.btr) {
             return Ok(Some(TimingRequest::Exact(timing)));
         }

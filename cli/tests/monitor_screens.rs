@@ -50,6 +50,7 @@ fn one_screen_is_text_of_the_size_that_was_asked_for() {
         ("monitor a.log -d virtual", 2, "--device"),
         ("monitor -d virtual -b 999999 --once", 1, "947368"),
         ("monitor -d virtual -c 3 --once", 2, "a channel is 1, 2 or both"),
+        ("monitor -d virtual -b 3:250k --once", 2, "a device has no channel 3"),
     ] {
         let (got, _, err) = cantap(line);
         assert!(got == Some(code) && err.contains(part), "{line}: {got:?} {err}");
@@ -87,4 +88,21 @@ fn channels_are_opened_as_by_the_other_commands() {
             "{line}\n{out}"
         );
     }
+}
+
+#[test]
+fn what_the_device_leaves_out_gives_no_load() {
+    let line = "monitor -d virtual:load=50,frames=std8 -c 1 -b 500k --view statistics --once --size 120x40 -t 2500ms";
+    let load = |option: &str| {
+        let (code, out, _) = cantap(&format!("{line} {option}"));
+        assert!(code == Some(0) && out.contains("Channel 1: 500000 bit/s"), "{out}");
+        (
+            out.contains("Load"),
+            out.lines().nth(1).unwrap().contains(" %"),
+            out.contains("zeros stand in its place"),
+        )
+    };
+    assert_eq!(load(""), (true, true, false));
+    assert_eq!(load("--no-data"), (false, false, true));
+    assert_eq!(load("--no-stamps"), (false, false, false));
 }

@@ -100,6 +100,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let profile = load_profile(args.profile.as_deref(), &mut complaints);
     let decoder = load_databases(args, &profile, &mut complaints);
     let open = channel_args(args, &profile, &mut complaints);
+    if args.file.is_none() {
+        open.timing.check_channels()?;
+    }
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
     let filters = filters(args, &profile, &mut complaints);

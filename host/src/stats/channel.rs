@@ -109,10 +109,12 @@ impl ChannelStatistics {
     pub(super) fn new(
         number: u8,
         bitrate_bps: Option<u32>,
+        has_load: bool,
         origin_ns: i64,
         window_ns: u64,
         peaks: usize,
     ) -> Self {
+        let load_of_bps = bitrate_bps.filter(|_| has_load);
         Self {
             number,
             bitrate_bps,
@@ -125,14 +127,14 @@ impl ChannelStatistics {
             data_bytes: 0,
             span_ns: None,
             out_of_order: 0,
-            load: bitrate_bps.map(WorkLoad::new),
+            load: load_of_bps.map(WorkLoad::new),
             errors: Errors::default(),
             losses: Losses::default(),
             state: None,
             state_changes: 0,
             counters: None,
             transmit_failures: 0,
-            windows: Windows::new(number, origin_ns, window_ns, bitrate_bps, peaks),
+            windows: Windows::new(number, origin_ns, window_ns, load_of_bps, peaks),
             ids: Ids::default(),
             latest_ns: i64::MIN,
             gaps: 0,

@@ -28,6 +28,8 @@ pub struct Options {
     pub bitrate_bps: Option<u32>,
     /// Bit rates of single channels: channel from 1, bit/s.
     pub channel_bitrate_bps: Vec<(u8, u32)>,
+    /// Channels, from 1, whose frames came without their data or times: they have no load, whatever their bit rate.
+    pub without_load: Vec<u8>,
     /// Length of a window.
     pub window: Duration,
     /// How many of the busiest windows are kept.
@@ -37,7 +39,13 @@ pub struct Options {
 impl Default for Options {
     /// No bit rate, windows of a second, five peaks.
     fn default() -> Self {
-        Self { bitrate_bps: None, channel_bitrate_bps: Vec::new(), window: SECOND, peaks: 5 }
+        Self {
+            bitrate_bps: None,
+            channel_bitrate_bps: Vec::new(),
+            without_load: Vec::new(),
+            window: SECOND,
+            peaks: 5,
+        }
     }
 }
 
@@ -145,6 +153,7 @@ impl Statistics {
         self.channels.push(ChannelStatistics::new(
             record.channel,
             bitrate,
+            !self.options.without_load.contains(&record.channel),
             origin_ns,
             self.window_ns,
             self.options.peaks,

@@ -182,3 +182,20 @@ fn an_empty_trace_has_an_empty_summary() {
     assert_eq!((summary.frames, summary.first_s, summary.channels.len()), (0, None, 0));
     assert_eq!(statistics.last_ns(), None);
 }
+
+#[test]
+fn a_channel_of_which_frames_are_not_wholly_known_has_a_bit_rate_and_no_load() {
+    let options = Options { bitrate_bps: Some(1_000_000), without_load: vec![2], ..Options::default() };
+    let mut statistics = Statistics::new(options).unwrap();
+    let mut loads = Vec::new();
+    for n in 0..60 {
+        let record = frame(n * 50_000, n as u8 % 2 + 1, "123#00");
+        statistics.push_with(&record, |window| loads.push((window.channel, window.load_pct.is_some())));
+    }
+    assert!(loads.contains(&(1, true)) && loads.contains(&(2, false)), "{loads:?}");
+    assert!(!loads.contains(&(2, true)), "{loads:?}");
+    assert!(statistics.channels().iter().all(|channel| channel.bitrate_bps == Some(1_000_000)));
+    let summary = statistics.summary();
+    let known: Vec<bool> = summary.channels.iter().map(|channel| channel.bus_load_pct.is_some()).collect();
+    assert_eq!(known, [true, false]);
+}

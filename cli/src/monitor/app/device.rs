@@ -49,6 +49,7 @@ impl App {
         }
         let mut plan = plan.clone();
         plan.set_bit_rates(rates);
+        plan.open.timing.check_channels().map_err(|error| error.to_string())?;
         self.open(plan, model)
     }
 

@@ -134,10 +134,22 @@ impl Source<'_> {
             .iter()
             .map(|(channel, config)| (channel.number(), config.timing.bitrate_bps(hello.can_clock_hz)));
         let rates: Vec<_> = rates.collect();
-        if rates.iter().any(|(channel, rate)| model.options().bitrate_of(*channel) != Some(*rate)) {
+        let lacks =
+            |lacks: fn(&ChannelConfig) -> bool| opened.iter().filter(move |(_, config)| lacks(config));
+        let without_load: Vec<u8> = lacks(|config| config.omit_data || config.omit_stamps)
+            .map(|(channel, _)| channel.number())
+            .collect();
+        if lacks(|config| config.omit_data).next().is_some() && model.notice.is_empty() {
+            "the device leaves data out: zeros stand in its place, and the load is not known"
+                .clone_into(&mut model.notice);
+        }
+        if without_load != model.options().without_load
+            || rates.iter().any(|(channel, rate)| model.options().bitrate_of(*channel) != Some(*rate))
+        {
             let options = cantap::stats::Options {
                 bitrate_bps: None,
                 channel_bitrate_bps: rates,
+                without_load,
                 ..model.options().clone()
             };
             if let Err(error) = model.set_options(options) {

@@ -102,6 +102,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let open = channel_args(args, &profile, &mut complaints);
     if args.file.is_none() {
         open.timing.check_channels()?;
+        args.device.as_ref().map_or(Ok(()), Address::check)?;
     }
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;

@@ -343,12 +343,7 @@ fn connect(address: &Address) -> Result<Link, DeviceError> {
         #[cfg(not(feature = "serial"))]
         Address::Serial(_) => not_built(address, "serial"),
         #[cfg(feature = "virtual")]
-        Address::Virtual(options) => {
-            let options = options.parse().map_err(|error: crate::virtual_device::BadOption| {
-                DeviceError::BadAddress { address: address.to_string(), reason: error.to_string() }
-            })?;
-            Ok(crate::virtual_device::start(options)?.into_link())
-        }
+        Address::Virtual(options) => Ok(crate::virtual_device::start(parsed(options, address)?)?.into_link()),
         #[cfg(not(feature = "virtual"))]
         Address::Virtual(_) => not_built(address, "virtual"),
         #[cfg(feature = "emu")]
@@ -358,14 +353,39 @@ fn connect(address: &Address) -> Result<Link, DeviceError> {
     }
 }
 
+/// What stands behind an address's colon.
+#[cfg(any(feature = "virtual", feature = "emu"))]
+fn parsed<T: std::str::FromStr<Err: std::fmt::Display>>(
+    text: &str,
+    address: &Address,
+) -> Result<T, DeviceError> {
+    text.parse().map_err(|error: T::Err| DeviceError::BadAddress {
+        address: address.to_string(),
+        reason: error.to_string(),
+    })
+}
+
 #[cfg(feature = "emu")]
 fn emulated(file: &str, address: &Address) -> Result<Link, DeviceError> {
-    let (name, parsed) = (address.to_string(), file.parse::<cantap_sim::address::Address>());
-    let parsed = parsed
-        .map_err(|error| DeviceError::BadAddress { address: name.clone(), reason: error.to_string() })?;
-    let port =
-        parsed.open().map_err(|error| DeviceError::Emulation { address: name, reason: error.to_string() })?;
+    let board = parsed::<cantap_sim::address::Address>(file, address)?;
+    let port = board.open().map_err(|error| DeviceError::Emulation {
+        address: address.to_string(),
+        reason: error.to_string(),
+    })?;
     Ok(Link::new(port.reader, port.writer).keeping(port.device))
+}
+
+impl Address {
+    /// Whether the options behind it fit, which [`Device::open`] would say too. Nothing is opened but a log that they name.
+    pub fn check(&self) -> Result<(), DeviceError> {
+        match self {
+            #[cfg(feature = "virtual")]
+            Self::Virtual(options) => parsed::<crate::virtual_device::Options>(options, self).map(|_| ()),
+            #[cfg(feature = "emu")]
+            Self::Emulated(file) => parsed::<cantap_sim::address::Address>(file, self).map(|_| ()),
+            _ => Ok(()),
+        }
+    }
 }
 
 #[cfg(not(all(feature = "serial", feature = "virtual", feature = "emu")))]

@@ -5,7 +5,7 @@
 //! as it can be, where 1.5 % are too much; and for any other the rates around are listened to, until the frames themselves tell
 //! how fast the bus is (`hearing.rs`).
 
-mod hearing;
+pub(crate) mod hearing;
 #[cfg(all(test, feature = "virtual"))]
 mod on_the_virtual_device;
 
@@ -112,14 +112,14 @@ pub enum Outcome {
 pub struct Limits {
     /// At each rate while nothing at all happens; the first round. Later rounds take longer.
     pub dwell: Duration,
-    /// Altogether, while the bus is silent.
+    /// Altogether, while the bus is silent; but each common rate is tried once.
     pub silence: Duration,
 }
 
 impl Default for Limits {
-    /// For 20 frames a second and more; a silent bus is given up after six seconds.
+    /// For 20 frames a second and more; a silent bus is given up after ten seconds.
     fn default() -> Self {
-        Self { dwell: Duration::from_millis(60), silence: Duration::from_secs(6) }
+        Self { dwell: Duration::from_millis(60), silence: Duration::from_secs(10) }
     }
 }
 
@@ -156,6 +156,10 @@ struct Search<'a> {
     frames: Vec<Frame>,
     progress: &'a mut dyn FnMut(Progress) -> bool,
     errors: u64,
+    /// Something was heard, be it an error.
+    heard: bool,
+    /// The device's time at which a bus that is still silent is given up.
+    give_up: u64,
     stopped: bool,
 }
 
@@ -168,9 +172,18 @@ pub fn search(
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Outcome, DeviceError> {
     let records = device.records();
-    let mut search =
-        Search { device, channel, records, frames: Vec::new(), progress, errors: 0, stopped: false };
-    let started = search.device.time()?;
+    let mut search = Search {
+        device,
+        channel,
+        records,
+        frames: Vec::new(),
+        progress,
+        errors: 0,
+        heard: false,
+        give_up: u64::MAX,
+        stopped: false,
+    };
+    let give_up = device.time()?.saturating_add(search.ticks(limits.silence));
     let mut dwell = limits.dwell;
     loop {
         // Traffic that is there and fits none of the common rates is worth the long scan. Before it they are tried
@@ -194,9 +207,7 @@ pub fn search(
             let found = search.try_all(rates, dwell)?;
             return Ok(found.unwrap_or(Outcome::NoMatch { errors: search.errors, about_bps: None }));
         }
-        if search.ticks(limits.silence) < search.device.time()?.saturating_sub(started) {
-            return Ok(Outcome::NoTraffic);
-        }
+        search.give_up = give_up;
         // A quiet bus needs longer looks.
         dwell *= 3;
     }
@@ -228,9 +239,13 @@ impl Search<'_> {
             if self.stopped || !(self.progress)(step) {
                 return Ok(Some(Outcome::Stopped));
             }
+            if !self.heard && self.device.time()? > self.give_up {
+                return Ok(Some(Outcome::NoTraffic));
+            }
             let Ok(timing) = self.device.timing(bitrate_bps) else { continue };
             let heard = self.find(timing, dwell)?;
             self.errors += u64::from(heard.errors);
+            self.heard |= heard.frames + heard.errors > 0;
             if heard.is_good()
                 && let Some(found) = self.make_sure(bitrate_bps, heard, dwell)?
             {
@@ -389,18 +404,24 @@ impl Search<'_> {
         let inside = |bps: &u32| (bounds.least_bps..=bounds.most_bps).contains(&f64::from(*bps));
         let same = |bps: &u32| distance(bps) < middle * SAME;
         let nearest = |a: &u32, b: &u32| distance(a).total_cmp(&distance(b));
-        // On a long or badly terminated bus no edge is where it should be, and nothing is heard with the sharpest timing. Then
-        // a common rate is the likeliest.
-        let best = COMMON_BPS
-            .into_iter()
-            .find(same)
-            .or(clean.into_iter().min_by(nearest))
-            .or(COMMON_BPS.into_iter().filter(inside).min_by(nearest));
-        let Some(best_bps) = best else {
+        // Buses have round rates. On a long or badly terminated one no edge is where it should be, and nothing is heard with the
+        // sharpest timing: then a common rate is the likeliest.
+        let candidates = [
+            COMMON_BPS.into_iter().find(same),
+            round_rates(clock_hz, &bounds).min_by(nearest),
+            clean.into_iter().min_by(nearest),
+            COMMON_BPS.into_iter().filter(inside).min_by(nearest),
+        ];
+        if candidates == [None; 4] {
             return Ok(Some(Outcome::NoMatch { errors: self.errors, about_bps: Some(middle) }));
-        };
-        let heard = self.find(self.device.timing(best_bps)?, dwell)?;
-        Ok(if heard.is_good() { self.found(best_bps, heard) } else { None })
+        }
+        for bitrate_bps in candidates.into_iter().flatten() {
+            let heard = self.find(self.device.timing(bitrate_bps)?, dwell)?;
+            if heard.is_good() {
+                return Ok(self.found(bitrate_bps, heard));
+            }
+        }
+        Ok(None)
     }
 
     /// Whether the bus runs at a rate somewhat below the candidate's: then frames are heard a little below it that would not
@@ -466,6 +487,20 @@ enum Purpose {
 /// Controller clocks per bit, rounded.
 fn clocks_of(clock_hz: u32, rate: f64) -> u32 {
     (f64::from(clock_hz) / rate).round() as u32
+}
+
+/// The rates between the bounds that the clock reaches exactly and that are whole kilobits, but for the common ones: what leads
+/// here is none of those.
+fn round_rates(clock_hz: u32, bounds: &Bounds) -> impl Iterator<Item = u32> {
+    let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS)) as u32 / 1000;
+    let most = bounds.most_bps.min(f64::from(MAX_BITRATE_BPS)) as u32 / 1000;
+    let inside = bounds.least_bps..=bounds.most_bps;
+    (least..=most)
+        .map(|kbps| kbps * 1000)
+        .filter(move |bps| inside.contains(&f64::from(*bps)) && !COMMON_BPS.contains(bps))
+        .filter(move |bps| {
+            clock_hz.is_multiple_of(*bps) && BitTiming::of_clocks(clock_hz / bps).next().is_some()
+        })
 }
 
 /// The timing that takes the least of other rates: the latest sample point for a bus that is faster, and the shortest jump for one

@@ -23,8 +23,8 @@ pub struct Args {
     /// Which channel: 1 or 2.
     #[arg(short, long, default_value = "1", value_parser = channel_args::channel)]
     channel: Channel,
-    /// Give up after so long without any sign of traffic.
-    #[arg(short, long, default_value = "6s", value_name = "TIME", value_parser = args::duration)]
+    /// Give up after so long without any sign of traffic, but not before each common rate was tried once.
+    #[arg(short, long, default_value = "10s", value_name = "TIME", value_parser = args::duration)]
     timeout: Duration,
     /// Print one JSON object.
     #[arg(long)]

@@ -1,4 +1,4 @@
-//! The search on the virtual device, which hears whatever is within one per cent.
+//! The search on the virtual device, which hears what a controller with its bit timing would.
 
 use super::*;
 use crate::Address;
@@ -34,7 +34,7 @@ fn fifty_frames_a_second_are_enough_for_an_answer_within_a_second() {
     assert!(taken < Duration::from_secs(1), "{taken:?}");
 }
 
-/// The clock does not reach 253.97 kbit/s itself; the simulated controller hears what is within 1 %.
+/// The clock does not reach 253.97 kbit/s itself.
 #[test]
 fn an_odd_rate_is_not_taken_for_its_common_neighbour() {
     for bitrate in [253_968, 255_319, 480_000, 117_647] {
@@ -43,6 +43,30 @@ fn an_odd_rate_is_not_taken_for_its_common_neighbour() {
         let off = f64::from(bitrate_bps) / f64::from(bitrate) - 1.0;
         assert!(off.abs() < 0.01 && !COMMON_BPS.contains(&bitrate_bps), "{bitrate}: {bitrate_bps}");
     }
+}
+
+/// Neighbours that the clock reaches, half a per cent to one beside, are heard as well.
+#[test]
+fn a_round_rate_is_found_rather_than_its_neighbours() {
+    for (bitrate, seed) in [(300_000, 1), (300_000, 2), (120_000, 3), (150_000, 4), (400_000, 5), (60_000, 6)]
+    {
+        let (outcome, _) = search_on(&format!("bitrate={bitrate},load=30,frames=mix,seed={seed}"));
+        let found = matches!(outcome, Outcome::Found { bitrate_bps, .. } if bitrate_bps == bitrate);
+        assert!(found, "{bitrate}: {outcome:?}");
+    }
+}
+
+/// Ten milliseconds for each of the common rates are the first round, and more than the limit the second.
+#[test]
+fn a_silent_bus_is_given_up_in_time() {
+    let device = Device::open(&"virtual:load=0".parse::<Address>().unwrap()).unwrap();
+    let limits = Limits { dwell: Duration::from_millis(10), silence: Duration::from_millis(400) };
+    let from = device.time().unwrap();
+    let outcome = search(&device, Channel::Can1, &limits, &mut |_| true).unwrap();
+    let taken = device.time().unwrap() - from;
+    assert_eq!(outcome, Outcome::NoTraffic);
+    let [least, most] = [400, 700].map(|ms| ms * u64::from(device.hello().tick_hz) / 1000);
+    assert!((least..most).contains(&taken), "{taken} ticks");
 }
 
 #[test]

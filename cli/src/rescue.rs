@@ -33,15 +33,20 @@ impl<'d> Rescue<'d> {
         Ok(())
     }
 
-    /// As [`Self::look`], and waits until no channel is bus-off, or Ctrl-C: what is sent meanwhile would only fail. An error
-    /// is told by the next request.
-    pub fn wait(&mut self) {
-        while self.look().is_ok()
-            && self.recovery.as_ref().is_some_and(Recovery::is_waiting)
-            && !interrupt::requested()
-        {
+    /// As [`Self::look`], and waits until no channel is bus-off, or Ctrl-C: what is sent meanwhile would only fail. Returns
+    /// whether it had to wait. An error is told by the next request.
+    pub fn wait(&mut self) -> bool {
+        let mut waited = false;
+        while self.look().is_ok() && self.is_waiting() && !interrupt::requested() {
+            waited = true;
             std::thread::sleep(WAIT_EVERY);
         }
+        waited
+    }
+
+    /// Whether a channel is bus-off and will be brought back.
+    pub fn is_waiting(&self) -> bool {
+        self.recovery.as_ref().is_some_and(Recovery::is_waiting)
     }
 
     /// Looks the next time at once if a transmission failed for bus-off.

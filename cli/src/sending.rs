@@ -1,45 +1,77 @@
-//! What commands that send have in common: a device open for sending, and what became of each frame.
+//! What commands that send have in common: what became of each frame, how long to wait, and why frames were not sent.
 
 use std::io::Write;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::bail;
 use cantap::Device;
 use cantap::device::Transmission;
 use cantap::replay::Replay;
 use cantap::transmit::Stream;
-use cantap::wire::message::ChannelStatus;
-use cantap::wire::record::{ErrorState, TransmitFailure};
+use cantap::unsent::{Cause, PATIENCE, Watch};
+use cantap::wire::record::TransmitFailure;
+use cantap::wire::{CHANNELS, Channel};
 
 use crate::interrupt;
 use crate::rescue::Rescue;
 
-/// A frame that nobody acknowledged for so long is given up.
-pub const GIVE_UP_AFTER: Duration = Duration::from_secs(1);
-
 /// How often is looked whether to go on.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
+pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// Counts ends of transmissions, and prints them as candump would.
-#[derive(Default)]
-pub struct Tally {
-    /// Confirmed.
-    pub sent: u64,
-    /// Not sent.
-    pub failed: u64,
-    /// The last reason.
-    reason: Option<TransmitFailure>,
+/// Frames being sent: counts their ends, prints them as candump would, and notices when none leaves any more.
+pub struct Sending<'d> {
+    device: &'d Device,
+    rescue: Rescue<'d>,
+    watch: Watch<'d>,
     quiet: bool,
+    sent: u64,
+    failed: u64,
+    /// Periods that passed before their frame could leave.
+    overtaken: u64,
+    stands_still: bool,
+    /// What ended it, where only a yes or no could be told.
+    error: Option<anyhow::Error>,
 }
 
-impl Tally {
-    /// A tally that prints nothing if `quiet`.
-    pub fn new(quiet: bool) -> Self {
-        Self { quiet, ..Self::default() }
+impl<'d> Sending<'d> {
+    /// Nothing sent yet. Prints nothing if `quiet`.
+    pub fn new(device: &'d Device, rescue: Rescue<'d>, quiet: bool) -> Self {
+        Self {
+            device,
+            watch: Watch::new(device, rescue.is_on_duty()),
+            rescue,
+            quiet,
+            sent: 0,
+            failed: 0,
+            overtaken: 0,
+            stands_still: false,
+            error: None,
+        }
     }
 
-    /// Counts and prints.
-    pub fn add(&mut self, ends: &[Transmission]) -> anyhow::Result<()> {
+    /// Frames that were sent.
+    pub const fn sent(&self) -> u64 {
+        self.sent
+    }
+
+    /// Frames that ended, sent or not.
+    pub const fn ended(&self) -> u64 {
+        self.sent + self.failed
+    }
+
+    /// Whether it was given up because nothing left any more.
+    pub const fn stands_still(&self) -> bool {
+        self.stands_still
+    }
+
+    /// Whether nothing more is to be sent: it stands still, an error came, or Ctrl-C.
+    pub fn has_stopped(&self) -> bool {
+        self.stands_still || self.error.is_some() || interrupt::requested()
+    }
+
+    fn add(&mut self, ends: &[Transmission]) -> anyhow::Result<()> {
+        self.watch.note(ends);
+        self.rescue.note(ends);
         let mut out = std::io::stdout().lock();
         for end in ends {
             match end.result {
@@ -50,111 +82,154 @@ impl Tally {
                         writeln!(out, "({seconds}.{us:06}) can{} {frame} T", end.channel.index())?;
                     }
                 }
-                Err(reason) => {
-                    self.failed += 1;
-                    self.reason = Some(reason);
-                }
+                // The frame still waits, and will end once.
+                Err(TransmitFailure::Overtaken) => self.overtaken += 1,
+                Err(_) => self.failed += 1,
             }
         }
         Ok(())
     }
 
-    /// An error that says what to do if anything was not sent.
-    pub fn verdict(&self, still_waiting: usize) -> anyhow::Result<()> {
-        if still_waiting > 0 {
-            bail!(
-                "nobody acknowledged {still_waiting} of {} frames; check that another node is on the bus, at this \
-                 bit rate, and the termination",
-                self.sent + self.failed + still_waiting as u64
-            );
+    /// Takes notice of ends; false after Ctrl-C, an error, or when frames that are due (see [`Stream::oldest_due`]) stand
+    /// still. Waits while a channel is to come back from bus-off: what is sent meanwhile would only fail.
+    pub fn goes_on(&mut self, ends: &[Transmission], due: [Option<u64>; CHANNELS]) -> bool {
+        let goes_on = self.add(ends).and_then(|()| {
+            if self.rescue.wait() {
+                self.watch.excuse();
+            }
+            self.stands_still |= self.watch.stands_still(|channel, _| due[channel.index()])?;
+            Ok(!self.stands_still && !interrupt::requested())
+        });
+        self.or_stop(goes_on)
+    }
+
+    /// As [`Self::goes_on`], for what the device sends by itself, and without waiting.
+    pub fn device_goes_on(&mut self, ends: &[Transmission]) -> bool {
+        let goes_on = self.add(ends).and_then(|()| {
+            self.rescue.look()?;
+            if self.rescue.is_waiting() {
+                self.watch.excuse();
+            }
+            self.stands_still |= self.watch.stands_still(|_, status| (status.tx_pending > 0).then_some(0))?;
+            Ok(!self.stands_still && !interrupt::requested())
+        });
+        self.or_stop(goes_on)
+    }
+
+    fn or_stop(&mut self, goes_on: anyhow::Result<bool>) -> bool {
+        goes_on.unwrap_or_else(|error| {
+            self.error = Some(error);
+            false
+        })
+    }
+
+    /// Periods of a channel that passed without a frame, and frames that still wait, by the device's own count: of many
+    /// periods in a row not each is told.
+    pub fn periods_missed(&self, channel: Channel) -> anyhow::Result<u64> {
+        let status = self.device.status()?.channels[channel.index()];
+        let waiting = if self.stands_still { u64::from(status.tx_pending) } else { 0 };
+        Ok(u64::from(status.transmit_failures).saturating_sub(self.failed) + waiting)
+    }
+
+    /// What became of as many frames as were asked for; fewer if the user ended it. To be called before the channels are
+    /// closed.
+    pub fn outcome(&mut self, asked: u64) -> anyhow::Result<Outcome> {
+        if let Some(error) = self.error.take() {
+            return Err(error);
         }
-        match self.reason {
-            Some(reason) => bail!(
-                "{} of {} frames were not sent: {}",
-                self.failed,
-                self.sent + self.failed,
-                sentence(reason)
+        let not_sent = asked.saturating_sub(self.sent);
+        let cause = match (not_sent, self.overtaken) {
+            (0, 0) => None,
+            (0, _) => Some(Cause::Overtaken),
+            _ => Some(self.watch.cause()?),
+        };
+        Ok(Outcome { asked, not_sent, overtaken: self.overtaken, is_one_shot: self.failed > 0, cause })
+    }
+
+    /// Waits for the rest of a stream, until it stands still or Ctrl-C.
+    pub fn finish(&mut self, stream: &mut Stream<'_>) -> anyhow::Result<()> {
+        stream.flush()?;
+        while self.goes_on(&stream.take_ended(), stream.oldest_due()) && stream.under_way() > 0 {
+            stream.wait(LOOK_EVERY)?;
+        }
+        Ok(())
+    }
+
+    /// As [`Self::finish`], for a replay, whose last frames may be due long after the others.
+    pub fn finish_replay(&mut self, replay: &mut Replay<'_>) -> anyhow::Result<()> {
+        replay.flush()?;
+        while self.goes_on(&replay.take_ended(), replay.oldest_due()) && replay.under_way() > 0 {
+            replay.wait(LOOK_EVERY)?;
+        }
+        Ok(())
+    }
+}
+
+/// What became of the frames.
+pub struct Outcome {
+    asked: u64,
+    not_sent: u64,
+    overtaken: u64,
+    /// Some failed for good at the first try.
+    is_one_shot: bool,
+    /// Why, if anything went wrong.
+    cause: Option<Cause>,
+}
+
+impl Outcome {
+    /// Frames that were asked for and not sent.
+    pub const fn not_sent(&self) -> u64 {
+        self.not_sent
+    }
+
+    /// Why, in a sentence with what to do; nothing if all is well.
+    pub fn reason(&self) -> Option<String> {
+        let Self { asked, not_sent, overtaken, .. } = self;
+        let were_not = format!("{not_sent} of {asked} frames were not sent");
+        let again = if self.is_one_shot { ", or leave --one-shot away to try again until sent" } else { "" };
+        Some(match self.cause? {
+            Cause::Unacknowledged => format!(
+                "nobody acknowledged {not_sent} of {asked} frames; check that another node is on the bus, at this bit rate, \
+                 and the termination{again}"
             ),
+            Cause::Destroyed => {
+                format!("{were_not}: errors destroyed them; check bit rate and wiring{again}")
+            }
+            Cause::BusFull { load_pct } => {
+                let load = load_pct.map_or_else(String::new, |load| format!(", by {load:.0} %"));
+                format!(
+                    "{were_not}: the bus is full of frames with lower identifiers{load}, and arbitration was never won in \
+                     {} s; use a lower identifier, or a quieter bus",
+                    PATIENCE.as_secs()
+                )
+            }
+            Cause::BusOff => format!(
+                "{were_not}: the controller went bus-off; check bit rate, wiring and termination, and see --recovery"
+            ),
+            Cause::ArbitrationLost => {
+                format!("{were_not}: arbitration was lost; leave --one-shot away to try again until sent")
+            }
+            Cause::Overtaken if *not_sent == 0 => format!(
+                "all {asked} frames were sent, but {overtaken} periods passed without one: their period is shorter than the \
+                 bus allows; choose a longer --period"
+            ),
+            Cause::Overtaken => {
+                format!("{were_not}: their period is shorter than the bus allows; choose a longer --period")
+            }
+            Cause::Aborted => format!("{were_not}: they were aborted"),
+            Cause::Closed => format!("{were_not}: the channel was closed before"),
+            Cause::Unknown => format!(
+                "{were_not}: none left, and neither an error nor another frame was seen; check the transceiver and that the \
+                 bus is not stuck dominant"
+            ),
+        })
+    }
+
+    /// An error with the reason if anything went wrong.
+    pub fn verdict(&self) -> anyhow::Result<()> {
+        match self.reason() {
+            Some(reason) => bail!(reason),
             None => Ok(()),
         }
-    }
-}
-
-/// Looks after a bus while frames wait for their time: silence alone does not tell that it is dead.
-pub struct BusWatch<'d> {
-    device: &'d Device,
-    rescue: Rescue<'d>,
-    look_at: Instant,
-}
-
-impl<'d> BusWatch<'d> {
-    /// Watches the buses of a device, and brings its channels back from bus-off if it is to.
-    pub fn new(device: &'d Device, rescue: Rescue<'d>) -> Self {
-        Self { device, rescue, look_at: Instant::now() + GIVE_UP_AFTER }
-    }
-
-    /// Takes notice of how transmissions ended.
-    pub fn note(&mut self, ends: &[Transmission]) {
-        self.rescue.note(ends);
-    }
-
-    /// False after Ctrl-C, and where a controller is so far gone (error passive, bus-off) that nobody hears it.
-    pub fn goes_on(&mut self) -> bool {
-        const PASSIVE: u8 = 128;
-        self.rescue.wait();
-        if self.look_at <= Instant::now() {
-            self.look_at = Instant::now() + GIVE_UP_AFTER;
-            // An error is told by the next request.
-            let channels = self.device.status().map(|status| status.channels);
-            let is_gone = |channel: &ChannelStatus| {
-                let is_rescued = self.rescue.is_on_duty() && channel.state == ErrorState::BusOff;
-                channel.tec >= PASSIVE && !is_rescued
-            };
-            if channels.is_ok_and(|channels| channels.iter().any(is_gone)) {
-                return false;
-            }
-        }
-        !interrupt::requested()
-    }
-}
-
-/// Waits for the rest of a replay, which may be due long after the others, and adds each end up as it comes.
-pub fn see_out(replay: &mut Replay<'_>, tally: &mut Tally, bus: &mut BusWatch<'_>) -> anyhow::Result<()> {
-    let mut ended = |replay: &mut Replay<'_>, bus: &mut BusWatch<'_>| {
-        let ends = replay.take_ended();
-        bus.note(&ends);
-        tally.add(&ends)
-    };
-    replay.flush()?;
-    while replay.under_way() > 0 && bus.goes_on() {
-        replay.wait(LOOK_EVERY)?;
-        ended(replay, bus)?;
-    }
-    ended(replay, bus)
-}
-
-/// Waits for the rest of a stream, until nothing ends for [`GIVE_UP_AFTER`] or Ctrl-C, and adds it up.
-pub fn finish(stream: &mut Stream<'_>, tally: &mut Tally, rescue: &mut Rescue<'_>) -> anyhow::Result<()> {
-    stream.finish(|since| {
-        rescue.wait();
-        since < GIVE_UP_AFTER && !interrupt::requested()
-    })?;
-    tally.add(&stream.take_ended())
-}
-
-fn sentence(reason: TransmitFailure) -> &'static str {
-    match reason {
-        TransmitFailure::ArbitrationLost => {
-            "arbitration was lost; leave --one-shot away to try again until sent"
-        }
-        TransmitFailure::BusError => {
-            "an error hit them; check bit rate and wiring, or leave --one-shot away to try again until sent"
-        }
-        TransmitFailure::Aborted => "they were aborted",
-        TransmitFailure::Closed => "the channel was closed before",
-        TransmitFailure::BusOff => {
-            "the controller went bus-off; check bit rate, wiring and termination, and see --recovery"
-        }
-        TransmitFailure::Overtaken => "their period is shorter than the bus allows; choose a longer --period",
     }
 }

@@ -33,6 +33,7 @@ pub mod trace;
 pub mod transmit;
 #[cfg(feature = "signals")]
 pub mod trigger;
+pub mod unsent;
 #[cfg(feature = "virtual")]
 pub mod virtual_device;
 #[cfg(feature = "formats")]

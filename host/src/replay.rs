@@ -150,13 +150,13 @@ impl<'d> Replay<'d> {
     }
 
     /// Adds the trace's next frame. Waits while the device's queue is full or the frame's time too far ahead; returns false if
-    /// `go_on` said no meanwhile. It is given what has ended, as far as that is told before the wait is over.
+    /// `go_on` said no meanwhile.
     pub fn push(
         &mut self,
         end_ns: i64,
         channel: Channel,
         frame: Frame,
-        mut go_on: impl FnMut(Vec<Transmission>) -> bool,
+        mut go_on: impl FnMut(&mut Self) -> bool,
     ) -> Result<bool, DeviceError> {
         let (begin, end) = self.timetable.next(end_ns, channel, &frame);
         let ignore_times = self.timetable.pace.ignore_times;
@@ -171,12 +171,18 @@ impl<'d> Replay<'d> {
                     break;
                 }
                 self.stream.wait(LOOK_EVERY)?;
-                if !go_on(self.take_ended()) {
+                if !go_on(self) {
                     return Ok(false);
                 }
             }
         }
-        let Some(tag) = self.stream.push(channel, frame, at, || go_on(Vec::new()))? else { return Ok(false) };
+        while self.stream.is_full(channel) {
+            self.stream.wait_for_room()?;
+            if !go_on(self) {
+                return Ok(false);
+            }
+        }
+        let tag = self.stream.add(channel, frame, at)?;
         if !ignore_times {
             self.planned[channel.index()].push_back((tag, end));
         }
@@ -201,6 +207,11 @@ impl<'d> Replay<'d> {
     /// Frames handed over that have not ended.
     pub fn under_way(&self) -> usize {
         self.stream.under_way()
+    }
+
+    /// See [`Stream::oldest_due`].
+    pub fn oldest_due(&self) -> [Option<u64>; CHANNELS] {
+        self.stream.oldest_due()
     }
 
     /// How frames ended since the last call.

@@ -24,9 +24,18 @@ const TAGS: u32 = 1 << 24;
 #[derive(Default)]
 struct Lane {
     batch: heapless::Vec<TxFrame, MAX_SEND>,
-    /// Handed to the device and not confirmed.
-    under_way: usize,
+    /// Tag and due time (0: at once) of what has not ended, in order, the batch's frames included.
+    waiting: VecDeque<(u32, u64)>,
     next_tag: u32,
+}
+
+impl Lane {
+    fn end(&mut self, tag: u32) {
+        // Nearly always the first; what is given up may end out of order.
+        if let Some(at) = self.waiting.iter().position(|(waiting, _)| *waiting == tag) {
+            self.waiting.remove(at);
+        }
+    }
 }
 
 /// A stream of frames to one device's channels.
@@ -52,33 +61,54 @@ impl<'d> Stream<'d> {
     }
 
     /// Adds a frame, to be sent not before a device time. Waits while the device's queue is full, and returns
-    /// false if `go_on` said no meanwhile. Returns the tag that its confirmation will bear.
+    /// nothing if `go_on` said no meanwhile. Returns the tag that its confirmation will bear.
     pub fn push(
         &mut self,
         channel: Channel,
         frame: Frame,
         at_ticks: Option<u64>,
-        mut go_on: impl FnMut() -> bool,
+        mut go_on: impl FnMut(&mut Self) -> bool,
     ) -> Result<Option<u32>, DeviceError> {
-        let room = usize::from(self.device.hello().tx_queue).max(1);
-        while self.lane(channel).under_way + self.lane(channel).batch.len() >= room {
-            // All of it has to be on its way before anything can be waited for.
-            self.flush()?;
-            self.collect(LOOK_EVERY)?;
-            if !go_on() {
+        while self.is_full(channel) {
+            self.wait_for_room()?;
+            if !go_on(self) {
                 return Ok(None);
             }
         }
+        self.add(channel, frame, at_ticks).map(Some)
+    }
+
+    /// Whether there is no room in the device's queue.
+    pub(crate) fn is_full(&self, channel: Channel) -> bool {
+        let room = usize::from(self.device.hello().tx_queue).max(1);
+        self.lanes[channel.index()].waiting.len() >= room
+    }
+
+    /// Waits a while for something to end.
+    pub(crate) fn wait_for_room(&mut self) -> Result<(), DeviceError> {
+        // All of it has to be on its way before anything can be waited for.
+        self.flush()?;
+        self.collect(LOOK_EVERY)
+    }
+
+    /// Adds a frame where there is room.
+    pub(crate) fn add(
+        &mut self,
+        channel: Channel,
+        frame: Frame,
+        at_ticks: Option<u64>,
+    ) -> Result<u32, DeviceError> {
         let lane = self.lane(channel);
         let tag = lane.next_tag;
         lane.next_tag = (tag + 1) % TAGS;
         // Cannot fail: a full batch is sent below.
         let _ = lane.batch.push(TxFrame { tag, frame, at_ticks });
+        lane.waiting.push_back((tag, at_ticks.unwrap_or(0)));
         if lane.batch.is_full() {
             self.send(channel)?;
         }
         self.collect(Duration::ZERO)?;
-        Ok(Some(tag))
+        Ok(tag)
     }
 
     /// Hands everything to the device.
@@ -118,7 +148,12 @@ impl<'d> Stream<'d> {
 
     /// Frames handed over that have not ended.
     pub fn under_way(&self) -> usize {
-        self.lanes.iter().map(|lane| lane.under_way).sum()
+        self.lanes.iter().map(|lane| lane.waiting.len() - lane.batch.len()).sum()
+    }
+
+    /// Since when the oldest frame of each channel is due, in ticks (0: at once), if one has not ended.
+    pub fn oldest_due(&self) -> [Option<u64>; CHANNELS] {
+        self.lanes.each_ref().map(|lane| lane.waiting.front().map(|(_, due)| *due))
     }
 
     /// How transmissions ended since the last call, in the device's order.
@@ -133,7 +168,6 @@ impl<'d> Stream<'d> {
     fn send(&mut self, channel: Channel) -> Result<(), DeviceError> {
         let lane = self.lane(channel);
         let frames = std::mem::take(&mut lane.batch);
-        lane.under_way += frames.len();
         if self.requests.len() >= REQUESTS
             && let Some(oldest) = self.requests.pop_front()
         {
@@ -150,8 +184,7 @@ impl<'d> Stream<'d> {
             match self.confirmations.recv_timeout(wait) {
                 Ok(end) => {
                     if end.tag < TAGS {
-                        let lane = self.lane(end.channel);
-                        lane.under_way = lane.under_way.saturating_sub(1);
+                        self.lane(end.channel).end(end.tag);
                     }
                     self.ended.push(end);
                     wait = Duration::ZERO;

@@ -11,14 +11,15 @@ use cantap::{Address, Channel, Device, Frame, Id};
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::interrupt;
-use crate::sending::{self, BusWatch, Tally};
+use crate::sending::Sending;
 use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
     after_help = "Modes for -I, -L and -D: r random, i counting up, e even random, o odd random, or a value. Data that count up are one byte \
-                        at least. A full queue is always waited for, so cangen's -p and -i change nothing.\n\n\
+                        at least. A full queue is always waited for, so cangen's -p and -i change nothing. When no frame leaves for a second, it \
+                        ends and says why.\n\n\
                         Examples:\n  cantap gen -d virtual can0 -g 10 -I 42A -L 8 -D i -n 1000\n  \
                         cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m\n  cantap gen -d virtual can1 -g 100 -c 8 -n 80"
 )]
@@ -216,23 +217,24 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A trace of frames that all end at once, held apart by the gap.
     let pace = Pace { shortest_gap: gap, burst: args.burst, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut tally = Tally::new(!args.verbose);
-    let mut bus = BusWatch::new(&device, args.open.rescue(&device));
+    let mut sending = Sending::new(&device, args.open.rescue(&device), !args.verbose);
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
     while args.frames.is_none_or(|frames| generator.count < frames) {
         let frame = generator.frame();
-        if !bus.goes_on() || !replay.push(0, args.channel, frame, |_| bus.goes_on())? {
+        let mut goes_on =
+            |replay: &mut Replay<'_>| sending.goes_on(&replay.take_ended(), replay.oldest_due());
+        if !goes_on(&mut replay) || !replay.push(0, args.channel, frame, goes_on)? {
             break;
         }
-        let ends = replay.take_ended();
-        bus.note(&ends);
-        tally.add(&ends)?;
     }
-    sending::see_out(&mut replay, &mut tally, &mut bus)?;
-    let waiting = replay.under_way();
+    if !sending.stands_still() {
+        sending.finish_replay(&mut replay)?;
+    }
+    let asked = if sending.stands_still() { args.frames.unwrap_or(generator.count) } else { sending.ended() };
+    let outcome = sending.outcome(asked)?;
     device.stop()?;
-    eprintln!("cantap: {} frames sent", tally.sent);
-    tally.verdict(if interrupt::requested() { 0 } else { waiting })?;
+    eprintln!("cantap: {} frames sent", sending.sent());
+    outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -6,7 +6,6 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, bail};
-use cantap::device::Transmission;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
@@ -14,7 +13,7 @@ use cantap::{Address, Channel, Device, TraceEvent};
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::input::ReadArgs;
-use crate::sending::{self, BusWatch, Tally};
+use crate::sending::Sending;
 use crate::wrong::wrong;
 use crate::{args, interrupt};
 
@@ -22,7 +21,8 @@ use crate::{args, interrupt};
 #[derive(clap::Args)]
 #[command(
     after_help = "The device keeps the times: frames end as far apart as in the trace. Frames of channels that the device does \
-                  not have, or that no mapping names, are left out.\n\nExamples:\n  \
+                  not have, or that no mapping names, are left out. When frames that are due do not leave for a second, it ends \
+                  and says why; with --json as reason.\n\nExamples:\n  \
                   cantap replay -d /dev/ttyACM0 -b 500k drive.log\n  \
                   cantap replay -d virtual -b 1M drive.blf --speed 2 -l 3 can0=can1"
 )]
@@ -145,7 +145,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let source = args.source()?;
     // What is wrong with the file is found before anything is opened.
-    if source.input.as_os_str() != "-" {
+    if !source.is_pipe() {
         drop(args.read.open(&source.input)?);
     } else if args.rounds != Rounds::Times(1) {
         bail!("standard input can be played once only; give a file to repeat it");
@@ -170,14 +170,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ignore_times: args.ignore_times,
     };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut tally = Tally::new(!args.verbose);
-    let mut bus = BusWatch::new(&device, args.open.rescue(&device));
-    let (started, left_out) =
-        (Instant::now(), args.play(&source, &mut replay, &mut tally, &mut bus, &mut buses)?);
-    // The last frames may be due long after the others.
-    sending::see_out(&mut replay, &mut tally, &mut bus)?;
-    let waiting = replay.under_way();
+    let mut sending = Sending::new(&device, args.open.rescue(&device), !args.verbose);
+    let started = Instant::now();
+    let Played { asked, left_out } = args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();
+    let outcome = sending.outcome(asked)?;
     device.stop()?;
     let accuracy = replay.accuracy();
     if args.json {
@@ -185,8 +182,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             std::io::stdout(),
             "{}",
             serde_json::json!({
-                "frames": tally.sent,
-                "failed": tally.failed,
+                "frames": sending.sent(),
+                "failed": outcome.not_sent(),
+                "reason": outcome.reason(),
                 "left_out": left_out,
                 "seconds": seconds,
                 "early_us": accuracy.early_us,
@@ -194,7 +192,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             })
         )?;
     } else {
-        eprint!("cantap: {} frames in {seconds:.1} s", tally.sent);
+        eprint!("cantap: {} frames in {seconds:.1} s", sending.sent());
         if left_out > 0 {
             eprint!(", {left_out} of other channels left out");
         }
@@ -206,8 +204,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         eprintln!();
     }
-    tally.verdict(if interrupt::requested() { 0 } else { waiting })?;
+    outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
+}
+
+/// What was played.
+#[derive(Default)]
+struct Played {
+    /// Frames that were to be sent: after a standstill those that were never handed over too, after Ctrl-C only those that
+    /// ended.
+    asked: u64,
+    /// Frames of channels that nothing is sent to.
+    left_out: u64,
 }
 
 /// What is played, and where to.
@@ -223,6 +231,11 @@ impl Source {
             return Channel::ALL.to_vec();
         }
         Channel::ALL.into_iter().filter(|channel| self.mapping.iter().any(|(to, _)| to == channel)).collect()
+    }
+
+    /// Whether it can be read only once, and as fast as it comes.
+    fn is_pipe(&self) -> bool {
+        self.input.as_os_str() == "-"
     }
 
     fn target(&self, from: u8) -> Option<Channel> {
@@ -260,54 +273,52 @@ impl Args {
         Ok(Source { input, mapping })
     }
 
-    /// Hands the trace to the device. Returns how many frames were left out.
+    /// Plays the trace until everything has ended or stands still.
     fn play(
         &self,
         source: &Source,
         replay: &mut Replay<'_>,
-        tally: &mut Tally,
-        bus: &mut BusWatch<'_>,
+        sending: &mut Sending<'_>,
         buses: &mut Buses<'_>,
-    ) -> anyhow::Result<u64> {
-        let (mut pushed, mut left_out) = (0_u64, 0);
+    ) -> anyhow::Result<Played> {
+        let mut played = Played::default();
         // A round begins where the one before ended.
         let mut shift_ns = 0;
         let mut round = 0_u32;
-        loop {
+        while self.rounds != Rounds::Times(round) && !self.has_all(&played) && !sending.has_stopped() {
+            let before = played.asked;
             let mut first_ns = None;
             let mut last_ns = 0;
             let mut records = self.read.open(&source.input)?;
-            while let Some(record) = records.next()? {
+            // A pipe may have no end, and what is played for ever has none: there nothing is counted that was not read.
+            let ends = !source.is_pipe() && self.rounds != Rounds::ForEver;
+            while !self.has_all(&played)
+                && (ends || !sending.has_stopped())
+                && !interrupt::requested()
+                && let Some(record) = records.next()?
+            {
                 let TraceEvent::Frame { frame, .. } = record.event else {
                     continue;
                 };
                 let Some(channel) = source.target(record.channel) else {
-                    left_out += 1;
+                    played.left_out += 1;
                     continue;
                 };
-                if self.frames.is_some_and(|frames| pushed >= frames) {
-                    return Ok(left_out);
+                played.asked += 1;
+                if sending.has_stopped() {
+                    // Never handed over, but asked for.
+                    continue;
                 }
                 buses.open(channel)?;
                 let first_ns = *first_ns.get_or_insert(record.time_ns);
                 last_ns = record.time_ns - first_ns + shift_ns;
-                let mut told = Ok(());
-                let go_on = |ends: Vec<Transmission>| {
-                    bus.note(&ends);
-                    told = tally.add(&ends);
-                    told.is_ok() && bus.goes_on()
-                };
-                let goes_on = replay.push(last_ns, channel, frame, go_on)?;
-                told?;
-                if !goes_on {
-                    return Ok(left_out);
+                let goes_on =
+                    |replay: &mut Replay<'_>| sending.goes_on(&replay.take_ended(), replay.oldest_due());
+                if replay.push(last_ns, channel, frame, goes_on)? {
+                    sending.goes_on(&replay.take_ended(), replay.oldest_due());
                 }
-                pushed += 1;
-                let ends = replay.take_ended();
-                bus.note(&ends);
-                tally.add(&ends)?;
             }
-            if first_ns.is_none() {
+            if played.asked == 0 && !interrupt::requested() {
                 bail!(
                     "'{}' has no frame to send; see `cantap replay --help` for channels",
                     source.input.display()
@@ -315,9 +326,20 @@ impl Args {
             }
             round += 1;
             shift_ns = last_ns + 1_000_000;
-            if self.rounds == Rounds::Times(round) {
-                return Ok(left_out);
+            if let (true, Rounds::Times(rounds)) = (sending.has_stopped(), self.rounds) {
+                played.asked += u64::from(rounds - round) * (played.asked - before);
             }
         }
+        sending.finish_replay(replay)?;
+        played.asked = match self.frames {
+            _ if !sending.stands_still() => sending.ended(),
+            Some(frames) => played.asked.min(frames),
+            None => played.asked,
+        };
+        Ok(played)
+    }
+
+    fn has_all(&self, played: &Played) -> bool {
+        self.frames.is_some_and(|frames| played.asked >= frames)
     }
 }

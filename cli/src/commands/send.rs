@@ -17,8 +17,7 @@ use modifiers::Modifiers;
 
 use crate::channel_args::{self, ChannelArgs};
 use crate::databases::DatabaseArgs;
-use crate::rescue::Rescue;
-use crate::sending::{self, GIVE_UP_AFTER, Tally};
+use crate::sending::{LOOK_EVERY, Sending};
 use crate::wrong::wrong;
 use crate::{args, interrupt};
 
@@ -26,7 +25,7 @@ use crate::{args, interrupt};
 #[derive(clap::Args)]
 #[command(after_help = "Frames are written as 123#DEADBEEF, 5A1#11.22.33, 123#R3, 1F334455#1122, or as \
                   Message:Signal=value,Signal=value with --db.\nEach frame that was sent is printed with the time at \
-                  which it ended on the bus.\n\nExamples:\n  cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
+                  which it ended on the bus. When none leaves for a second, it ends and says why.\n\nExamples:\n  cantap send -d /dev/ttyACM0 -b 500k can0 123#DEADBEEF\n  \
                   cantap send -d virtual can1 123#00 --period 10ms --count 100 --counter 0\n  \
                   cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
                   cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
@@ -66,9 +65,6 @@ pub struct Args {
     quiet: bool,
 }
 
-/// How long to wait before looking at the clock and Ctrl-C.
-const LOOK_EVERY: Duration = Duration::from_millis(20);
-
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything that can be wrong on the line is found before anything is sent.
@@ -78,9 +74,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = Device::open(&args.device)?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
-    let mut tally = Tally::new(args.quiet);
-    let mut rescue = args.open.rescue(&device);
-    let waiting = match (triggers, periodic) {
+    let mut sending = Sending::new(&device, args.open.rescue(&device), args.quiet);
+    let asked = match (triggers, periodic) {
         (Some(triggers), _) => {
             let slots = device.hello().trigger_slots;
             if triggers.len() > usize::from(slots) {
@@ -90,7 +85,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             for (slot, trigger) in (0..).zip(triggers) {
                 device.set_trigger(args.channel, slot, Some(trigger))?;
             }
-            args.watch(stream, TRIGGER_TAG, &mut tally, args.count.map(u64::from), &mut rescue)?
+            args.watch(stream, TRIGGER_TAG, &mut sending, args.count.map(u64::from))?
         }
         (None, Some((period, modifiers))) => {
             let period_ticks = periodic::period_ticks(period, device.hello().tick_hz)
@@ -110,12 +105,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 device.set_periodic(args.channel, slot, Some(entry))?;
             }
             let wanted = args.count.map(|count| u64::from(count) * frames.len() as u64);
-            args.watch(stream, DEVICE_TAG, &mut tally, wanted, &mut rescue)?
+            args.watch(stream, DEVICE_TAG, &mut sending, wanted)?
         }
-        (None, None) => args.send_now(&device, &frames, &mut tally, &mut rescue)?,
+        (None, None) => args.send_now(&device, &frames, &mut sending)?,
     };
+    let outcome = sending.outcome(asked)?;
     device.stop()?;
-    tally.verdict(waiting)?;
+    outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -185,67 +181,51 @@ impl Args {
         interrupt::requested() || self.time.is_some_and(|time| started.elapsed() >= time)
     }
 
-    /// Sends the frames one after the other, `count` times. Returns how many are still waiting.
-    fn send_now(
-        &self,
-        device: &Device,
-        frames: &[Frame],
-        tally: &mut Tally,
-        rescue: &mut Rescue<'_>,
-    ) -> anyhow::Result<usize> {
+    /// Sends the frames one after the other, `count` times. Returns how many were asked for.
+    fn send_now(&self, device: &Device, frames: &[Frame], sending: &mut Sending<'_>) -> anyhow::Result<u64> {
         let mut stream = Stream::new(device);
         let started = Instant::now();
-        let mut last = Instant::now();
-        'rounds: for _ in 0..self.count.unwrap_or(1) {
+        let rounds = self.count.unwrap_or(1);
+        let mut goes_on = |stream: &mut Stream<'_>| {
+            sending.goes_on(&stream.take_ended(), stream.oldest_due()) && !self.is_over(started)
+        };
+        'rounds: for _ in 0..rounds {
             for frame in frames {
-                let mut stuck = false;
-                let go_on = || {
-                    stuck = last.elapsed() > GIVE_UP_AFTER;
-                    rescue.wait();
-                    !stuck && !self.is_over(started)
-                };
-                if stream.push(self.channel, *frame, None, go_on)?.is_none() || self.is_over(started) {
+                if stream.push(self.channel, *frame, None, &mut goes_on)?.is_none() || !goes_on(&mut stream) {
                     break 'rounds;
-                }
-                let ends = stream.take_ended();
-                rescue.note(&ends);
-                if !ends.is_empty() {
-                    last = Instant::now();
-                    tally.add(&ends)?;
                 }
             }
         }
-        sending::finish(&mut stream, tally, rescue)?;
-        Ok(stream.under_way())
+        sending.finish(&mut stream)?;
+        let all = u64::from(rounds) * frames.len() as u64;
+        Ok(if sending.stands_still() { all } else { sending.ended() })
     }
 
-    /// Watches what the device sends by itself, with tags from `first_tag`, until there are as many as wanted.
+    /// Watches what the device sends by itself, with tags from `first_tag`, until as many as wanted have ended. Returns how
+    /// many were asked for.
     fn watch(
         &self,
         mut stream: Stream<'_>,
         first_tag: u32,
-        tally: &mut Tally,
+        sending: &mut Sending<'_>,
         wanted: Option<u64>,
-        rescue: &mut Rescue<'_>,
-    ) -> anyhow::Result<usize> {
+    ) -> anyhow::Result<u64> {
         let started = Instant::now();
-        let period = self.period.unwrap_or_default();
-        let mut last = Instant::now();
-        while !self.is_over(started) && wanted.is_none_or(|wanted| tally.sent < wanted) {
+        while !self.is_over(started) && wanted.is_none_or(|wanted| sending.ended() < wanted) {
             stream.wait(LOOK_EVERY)?;
-            rescue.look()?;
             let mut ends = stream.take_ended();
             ends.retain(|end| end.tag >= first_tag);
-            if !ends.is_empty() {
-                last = Instant::now();
-            }
-            tally.add(&ends)?;
-            // A bus that takes nothing would keep a counted transmission for ever.
-            if self.period.is_some() && last.elapsed() > period + GIVE_UP_AFTER {
-                return Ok(wanted.map_or(1, |wanted| (wanted - tally.sent) as usize));
+            if !sending.device_goes_on(&ends) {
+                break;
             }
         }
-        Ok(0)
+        let missed = if self.period.is_some() { sending.periods_missed(self.channel)? } else { 0 };
+        Ok(match wanted {
+            Some(wanted) if sending.stands_still() => wanted,
+            // Ended by its time or Ctrl-C: what was due until then.
+            Some(wanted) => wanted.min(sending.ended() + missed),
+            None => sending.ended() + missed,
+        })
     }
 }
 

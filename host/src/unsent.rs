@@ -1,0 +1,405 @@
+//! Why frames were not sent: the one place that decides it, from what the device's stream and its status tell.
+//!
+//! A device tells how each transmission ended, but not why one does not end at all: a controller tries for ever. Then the
+//! errors since its last frame, its state and what others send tell what is in the way. The records of the device are taken
+//! for it, so it is for programs that do not use them otherwise.
+
+use std::time::{Duration, Instant};
+
+use cantap_wire::message::ChannelStatus;
+use cantap_wire::record::{BusErrorKind, ErrorState, TransmitFailure};
+use cantap_wire::{CHANNELS, Channel};
+
+use crate::bits::FrameBits;
+use crate::device::{Records, Transmission};
+use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
+
+/// Frames that are due and of which none ended for so long stand still.
+pub const PATIENCE: Duration = Duration::from_secs(1);
+/// How often the device is asked how it is.
+const LOOK_EVERY: Duration = Duration::from_millis(250);
+/// From this load on, in per cent, a bus is full for whoever has a high identifier.
+const FULL_PCT: f64 = 80.0;
+/// A load is told only over a time that is long against a frame.
+const LEAST_SPAN_NS: i64 = 100_000_000;
+
+/// Why frames were not sent.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Cause {
+    /// No other node acknowledged them.
+    Unacknowledged,
+    /// Errors destroyed them, or kept the controller from finding a pause.
+    Destroyed,
+    /// Arbitration was lost to other frames again and again.
+    BusFull {
+        /// Load by others in per cent, where the stream's stamps and data tell it.
+        load_pct: Option<f64>,
+    },
+    /// The controller went bus-off.
+    BusOff,
+    /// One-shot mode, and arbitration was lost.
+    ArbitrationLost,
+    /// Their period is shorter than the bus allows.
+    Overtaken,
+    /// The host took them back.
+    Aborted,
+    /// The channel was closed.
+    Closed,
+    /// Nothing was seen on the bus that would tell.
+    Unknown,
+}
+
+/// Bus errors by what they say of our frames.
+#[derive(Clone, Copy, Default)]
+struct Errors {
+    unacknowledged: u64,
+    /// Bits read otherwise than sent: only a sender finds those.
+    destroyed: u64,
+    /// Found while others sent.
+    received: u64,
+}
+
+impl Errors {
+    fn add(&mut self, kind: Option<BusErrorKind>) {
+        *match kind {
+            Some(BusErrorKind::Acknowledgment) => &mut self.unacknowledged,
+            Some(BusErrorKind::BitDominant | BusErrorKind::BitRecessive) => &mut self.destroyed,
+            Some(BusErrorKind::Stuff | BusErrorKind::Form | BusErrorKind::Crc) | None => &mut self.received,
+        } += 1;
+    }
+
+    /// What hit our own frames, if anything did.
+    fn cause(self) -> Option<Cause> {
+        match self {
+            Self { unacknowledged: 0, destroyed: 0, .. } => None,
+            Self { unacknowledged, destroyed, .. } if unacknowledged >= destroyed => {
+                Some(Cause::Unacknowledged)
+            }
+            _ => Some(Cause::Destroyed),
+        }
+    }
+}
+
+/// Frames of other nodes.
+#[derive(Clone, Copy, Default)]
+struct Others {
+    /// End of the first and of the last.
+    span_ns: Option<(i64, i64)>,
+    /// On the bus within the span.
+    bits: u64,
+}
+
+impl Others {
+    fn add(&mut self, end_ns: i64, bits: u32) {
+        match &mut self.span_ns {
+            None => self.span_ns = Some((end_ns, end_ns)),
+            Some((_, last_ns)) => {
+                *last_ns = end_ns;
+                self.bits += u64::from(bits);
+            }
+        }
+    }
+
+    fn load_pct(&self, bitrate_bps: u32) -> Option<f64> {
+        let (first_ns, last_ns) = self.span_ns?;
+        let span_ns = last_ns.saturating_sub(first_ns);
+        let load_pct = self.bits as f64 * 1e11 / (f64::from(bitrate_bps) * span_ns as f64);
+        (span_ns >= LEAST_SPAN_NS).then_some(load_pct.min(100.0))
+    }
+}
+
+/// What is known of one channel.
+#[derive(Default)]
+struct Seen {
+    errors: Errors,
+    /// The next three: since a frame of ours was sent last.
+    errors_since: Errors,
+    others_since: Others,
+    went_off_since: bool,
+    /// How often each reason was told, [`TransmitFailure::Overtaken`] apart.
+    failures: Vec<(TransmitFailure, u64)>,
+    overtaken: u64,
+    /// Device time, in ticks, and the host's, from which a standstill counts.
+    waiting_since: Option<(u64, Instant)>,
+    stands_still: bool,
+}
+
+impl Seen {
+    fn push(&mut self, record: &TraceRecord) {
+        match record.event {
+            TraceEvent::Frame { direction: Direction::Tx, .. } => {
+                self.errors_since = Errors::default();
+                self.others_since = Others::default();
+                self.went_off_since = false;
+            }
+            TraceEvent::Frame { frame, .. } => {
+                self.others_since.add(record.time_ns, FrameBits::of(&frame).total());
+            }
+            TraceEvent::BusError { kind, .. } => {
+                self.errors.add(kind);
+                self.errors_since.add(kind);
+            }
+            TraceEvent::State { state, .. } => self.went_off_since |= state == ErrorState::BusOff,
+            _ => {}
+        }
+    }
+
+    fn note(&mut self, end: &Transmission) {
+        let Err(reason) = end.result else { return self.moved(end.ticks) };
+        if reason == TransmitFailure::Overtaken {
+            // A period has passed; the frame still waits.
+            self.overtaken += 1;
+            return;
+        }
+        self.moved(end.ticks);
+        match self.failures.iter_mut().find(|(known, _)| *known == reason) {
+            Some((_, count)) => *count += 1,
+            None => self.failures.push((reason, 1)),
+        }
+    }
+
+    /// Something ended.
+    fn moved(&mut self, ticks: u64) {
+        self.waiting_since = Some((ticks, Instant::now()));
+    }
+
+    fn failed(&self) -> u64 {
+        self.failures.iter().map(|(_, count)| count).sum()
+    }
+
+    fn cause(&self, status: &ChannelStatus, clock_hz: u32) -> Cause {
+        let told = self.failures.iter().max_by_key(|(_, count)| *count).map(|(reason, _)| *reason);
+        if status.state == ErrorState::BusOff || self.went_off_since || told == Some(TransmitFailure::BusOff)
+        {
+            return Cause::BusOff;
+        }
+        match told.filter(|_| !self.stands_still) {
+            None => self.obstacle(status, clock_hz),
+            Some(TransmitFailure::BusError) => self.errors.cause().unwrap_or(Cause::Destroyed),
+            Some(TransmitFailure::ArbitrationLost) => Cause::ArbitrationLost,
+            Some(TransmitFailure::Aborted) => Cause::Aborted,
+            Some(TransmitFailure::Closed) => Cause::Closed,
+            Some(TransmitFailure::BusOff) => Cause::BusOff,
+            Some(TransmitFailure::Overtaken) => Cause::Overtaken,
+        }
+    }
+
+    /// What is in the way of frames that still wait.
+    fn obstacle(&self, status: &ChannelStatus, clock_hz: u32) -> Cause {
+        if let Some(cause) = self.errors_since.cause() {
+            return cause;
+        }
+        // A load takes times and data, which a channel may leave out.
+        let whole = status.open.filter(|config| !config.omit_stamps && !config.omit_data);
+        let load_pct =
+            whole.and_then(|config| self.others_since.load_pct(config.timing.bitrate_bps(clock_hz)));
+        let others_send = self.others_since.span_ns.is_some();
+        if load_pct.map_or(others_send && self.stands_still, |load_pct| load_pct >= FULL_PCT) {
+            Cause::BusFull { load_pct }
+        } else if self.overtaken > 0 && !self.stands_still {
+            Cause::Overtaken
+        } else if self.errors_since.received > 0 {
+            Cause::Destroyed
+        } else {
+            Cause::Unknown
+        }
+    }
+}
+
+/// Watches frames being sent.
+pub struct Watch<'d> {
+    device: &'d Device,
+    records: Records,
+    channels: [Seen; CHANNELS],
+    recovers: bool,
+    look_at: Instant,
+}
+
+impl<'d> Watch<'d> {
+    /// Watches a device from now on. `recovers` says that somebody brings channels with manual recovery back from bus-off;
+    /// otherwise such a channel stands still.
+    pub fn new(device: &'d Device, recovers: bool) -> Self {
+        Self {
+            device,
+            records: device.records(),
+            channels: Default::default(),
+            recovers,
+            look_at: Instant::now(),
+        }
+    }
+
+    /// Takes notice of how transmissions ended.
+    pub fn note(&mut self, ends: &[Transmission]) {
+        for end in ends {
+            self.channels[end.channel.index()].note(end);
+        }
+    }
+
+    /// What waited so far did so for a good reason: patience begins anew.
+    pub fn excuse(&mut self) {
+        for seen in &mut self.channels {
+            seen.waiting_since = None;
+        }
+    }
+
+    /// Whether frames of a channel stand still: due, by the device's clock, and none of them ended for [`PATIENCE`]. `due`
+    /// tells since when the oldest frame of a channel waits, in ticks, if one does. To be called again and again; the device
+    /// is asked now and then.
+    pub fn stands_still(
+        &mut self,
+        due: impl Fn(Channel, &ChannelStatus) -> Option<u64>,
+    ) -> Result<bool, DeviceError> {
+        let now = Instant::now();
+        if now < self.look_at {
+            return Ok(false);
+        }
+        self.look_at = now + LOOK_EVERY;
+        self.take_records()?;
+        let status = self.device.status()?;
+        let patience_ticks = PATIENCE.as_secs() * u64::from(self.device.hello().tick_hz);
+        for channel in Channel::ALL {
+            let (state, seen) = (&status.channels[channel.index()], &mut self.channels[channel.index()]);
+            let Some(config) = state.open else { continue };
+            let is_gone = state.state == ErrorState::BusOff && config.manual_recovery && !self.recovers;
+            let waits = due(channel, state);
+            if waits.is_none() {
+                seen.waiting_since = None;
+            }
+            seen.stands_still = is_gone
+                || waits.is_some_and(|due| {
+                    let (since, since_here) = *seen.waiting_since.get_or_insert((status.ticks, now));
+                    // By both clocks: an emulated device's may be much slower than ours, or much faster.
+                    status.ticks.saturating_sub(since.max(due)) >= patience_ticks
+                        && now.saturating_duration_since(since_here) >= PATIENCE
+                });
+        }
+        Ok(self.channels.iter().any(|seen| seen.stands_still))
+    }
+
+    /// Why frames were not sent, on the channel that has most of them. The channels must still be open.
+    pub fn cause(&mut self) -> Result<Cause, DeviceError> {
+        self.take_records()?;
+        let status = self.device.status()?;
+        let clock_hz = self.device.hello().can_clock_hz;
+        let seen = self.channels.iter().zip(&status.channels);
+        let worst = seen.max_by_key(|(seen, _)| {
+            (seen.stands_still, seen.failed() + seen.overtaken, seen.errors_since.cause().is_some())
+        });
+        Ok(worst.map_or(Cause::Unknown, |(seen, status)| seen.cause(status, clock_hz)))
+    }
+
+    fn take_records(&mut self) -> Result<(), DeviceError> {
+        while let Some(batch) = self.records.next_batch(Duration::ZERO)? {
+            if batch.is_empty() {
+                break;
+            }
+            for record in &batch {
+                if let Some(channel) = Channel::from_number(record.channel) {
+                    self.channels[channel.index()].push(record);
+                }
+            }
+            self.records.recycle(batch);
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap_wire::BitTiming;
+    use cantap_wire::message::ChannelConfig;
+
+    const CLOCK_HZ: u32 = 36_000_000;
+
+    fn status(state: ErrorState) -> ChannelStatus {
+        let timing = BitTiming::choose(CLOCK_HZ, 500_000, None).unwrap();
+        ChannelStatus {
+            open: Some(ChannelConfig::listen_only(timing)),
+            state,
+            tec: 0,
+            rec: 0,
+            last_error: None,
+            frames: 0,
+            lost_controller: 0,
+            lost_queue: 0,
+            bus_errors: 0,
+            transmitted: 0,
+            transmit_failures: 0,
+            tx_pending: 1,
+        }
+    }
+
+    fn seen(events: &[TraceEvent], ends: &[TransmitFailure]) -> Seen {
+        let mut seen = Seen::default();
+        for (at, event) in (0..).zip(events) {
+            seen.push(&TraceRecord { time_ns: at * 1_000_000, channel: 1, event: *event });
+        }
+        for reason in ends {
+            let result = Err(*reason);
+            seen.note(&Transmission { channel: Channel::Can1, tag: 0, ticks: 0, time_ns: 0, result });
+        }
+        seen
+    }
+
+    fn frame(direction: Direction, text: &str) -> TraceEvent {
+        TraceEvent::Frame { frame: text.parse().unwrap(), direction, late: false }
+    }
+
+    fn error(kind: BusErrorKind) -> TraceEvent {
+        TraceEvent::BusError { kind: Some(kind), counters: None }
+    }
+
+    fn cause(mut seen: Seen, stands_still: bool) -> Cause {
+        seen.stands_still = stands_still;
+        seen.cause(&status(ErrorState::Active), CLOCK_HZ)
+    }
+
+    #[test]
+    fn what_stands_still_is_explained_by_what_was_seen_since_the_last_frame_of_ours() {
+        let (ack, bit) = (error(BusErrorKind::Acknowledgment), error(BusErrorKind::BitDominant));
+        let ours = frame(Direction::Tx, "123#");
+        assert_eq!(cause(seen(&[bit, ours, ack], &[]), true), Cause::Unacknowledged);
+        assert_eq!(cause(seen(&[ack, ours, bit], &[]), true), Cause::Destroyed);
+        assert_eq!(cause(seen(&[ack, ours], &[]), true), Cause::Unknown);
+        // Only a receiver finds those: others cannot send either.
+        assert_eq!(cause(seen(&[error(BusErrorKind::Stuff)], &[]), true), Cause::Destroyed);
+        let off = TraceEvent::State { state: ErrorState::BusOff, counters: None };
+        assert_eq!(cause(seen(&[bit, off], &[]), true), Cause::BusOff);
+        assert_eq!(cause(seen(&[off, ours], &[]), true), Cause::Unknown);
+    }
+
+    #[test]
+    fn a_bus_is_full_only_with_the_load_to_show_for_it() {
+        let text = "0F0#1122334455667788";
+        let others = frame(Direction::Rx, text);
+        // A quarter of each millisecond is not full.
+        assert_eq!(cause(seen(&[others; 200], &[]), true), Cause::Unknown);
+        let length_ns = i64::from(FrameBits::of(&text.parse().unwrap()).total()) * 2_000;
+        let mut full = Seen::default();
+        for at in 0..1000 {
+            full.push(&TraceRecord { time_ns: at * length_ns, channel: 1, event: others });
+        }
+        assert_eq!(cause(full, true), Cause::BusFull { load_pct: Some(100.0) });
+    }
+
+    #[test]
+    fn reasons_that_the_device_told_count_where_nothing_waits() {
+        use TransmitFailure::{ArbitrationLost, BusError, BusOff, Overtaken};
+        let ours = frame(Direction::Tx, "123#");
+        let (ack, bit) = (error(BusErrorKind::Acknowledgment), error(BusErrorKind::BitRecessive));
+        // One-shot: the errors were before the frames that came through.
+        assert_eq!(cause(seen(&[bit, bit, ours], &[BusError; 2]), false), Cause::Destroyed);
+        assert_eq!(cause(seen(&[ack, ack, ours], &[BusError; 2]), false), Cause::Unacknowledged);
+        assert_eq!(
+            cause(seen(&[], &[ArbitrationLost, ArbitrationLost, BusError]), false),
+            Cause::ArbitrationLost
+        );
+        assert_eq!(cause(seen(&[ours], &[BusOff]), false), Cause::BusOff);
+        // A period that passed is no frame that failed.
+        let overtaken = seen(&[ours], &[Overtaken; 5]);
+        assert_eq!((overtaken.failed(), overtaken.overtaken), (0, 5));
+        assert_eq!(cause(overtaken, false), Cause::Overtaken);
+        assert_eq!(cause(seen(&[ours, ack], &[Overtaken; 5]), false), Cause::Unacknowledged);
+    }
+}

@@ -188,6 +188,27 @@ fn every_request_of_a_flood_is_answered() {
     }
 }
 
+/// The news that the port is closed comes by the control pipe, past packets that must wait, and ends the capture.
+#[test]
+fn a_host_that_floods_and_never_reads_can_close_the_port() {
+    let Some(mut rig) = connected() else { return };
+    rig.listen(CAN1, MEGABIT).unwrap();
+    rig.with_host(|host, _| host.read(false));
+    for _ in 0..1500 {
+        let (_, bytes) = rig.session.request(Command::Status);
+        rig.with_host(|host, _| host.send(&bytes));
+    }
+    rig.run_for(100 * MS).unwrap();
+    assert!(rig.with_host(|host, _| host.unsent()) > 1000, "nothing had to wait");
+    rig.with_host(|host, _| host.close_port());
+    rig.run_for(20 * MS).unwrap();
+    rig.with_host(|host, _| host.read(true));
+    rig.wait_for_port().unwrap();
+    rig.greet().unwrap();
+    let status = rig.status().unwrap();
+    assert!(status.channels.iter().all(|channel| channel.open.is_none()), "{status:?}");
+}
+
 /// What a device need not know it stalls, and goes on.
 #[test]
 fn unknown_control_requests_are_refused_and_harm_nothing() {

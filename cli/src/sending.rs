@@ -196,9 +196,9 @@ impl Outcome {
                 format!("{were_not}: errors destroyed them; check bit rate and wiring{again}")
             }
             Cause::BusFull { load_pct } => {
-                let load = load_pct.map_or_else(String::new, |load| format!(", by {load:.0} %"));
+                let load = load_pct.map_or_else(String::new, |load| format!(" ({load:.0} %)"));
                 format!(
-                    "{were_not}: the bus is full of frames with lower identifiers{load}, and arbitration was never won in \
+                    "{were_not}: the bus is full{load} of frames with lower identifiers, and arbitration was never won in \
                      {} s; use a lower identifier, or a quieter bus",
                     PATIENCE.as_secs()
                 )

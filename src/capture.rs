@@ -152,9 +152,10 @@ impl<'q, const N: usize> Capture<'q, N> {
             if next > now + early {
                 return;
             }
-            // What is due soon after it would find no time for this between the two. A periodic frame is not waited past.
-            let periodic = self.due(Transmitter::periodic_due);
-            let until = (next.max(now) + early / 2).min(periodic[0]).min(periodic[1]);
+            // What is due soon after it would find no time for this between the two. A periodic frame is not waited past; one that
+            // is due already is no matter of waiting.
+            let periodic = self.due(Transmitter::periodic_due).into_iter().filter(|due| *due > now).min();
+            let until = (next.max(now) + early / 2).min(periodic.unwrap_or(NEVER));
             let mut mailboxes = [None; CHANNELS];
             for (channel, mailbox) in mailboxes.iter_mut().enumerate() {
                 if heads[channel] <= until {

@@ -366,6 +366,39 @@ fn manual_recovery_gives_the_queue_up_and_waits_for_the_command() {
 }
 
 /// A confirmation is never lost: while the host reads nothing, transmission stops before it.
+/// One channel's periodic frames cannot be confirmed for want of room, and wait; the other channel's frame is due meanwhile. An
+/// alarm that came again and again would keep USB from making room.
+#[test]
+fn what_waits_for_room_on_one_channel_raises_no_storm_of_alarms_for_the_other() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let entry = Some(periodic("100#", 1, 0, &[]));
+    bench.ask(Command::SetPeriodic { channel: CAN2, slot: 0, entry }).unwrap();
+    let due = bench.board.clock.now.get() + 310 * TICKS_PER_MS;
+    let frame = TxFrame { tag: 7, frame: numbered(7), at_ticks: Some(due.into()) };
+    bench.ask(Command::Send { channel: CAN1, frames: [frame].into_iter().collect() }).unwrap();
+    bench.port.takes = 0;
+    for number in 0..5000 {
+        bench.receive(CAN1, numbered(number));
+    }
+    // The kept part of the queue fills up with events.
+    for _ in 0..300 {
+        bench.millisecond();
+        bench.alarm();
+        bench.send_one(CAN2);
+    }
+    let mut alarms = 0;
+    for _ in 0..20 * TICKS_PER_MS / TICKS_PER_US {
+        bench.pass(TICKS_PER_US);
+        let now = bench.board.clock.now.get();
+        alarms +=
+            u32::from(bench.board.clock.alarm.get().is_some_and(|at| now.wrapping_sub(at) < u32::MAX / 2));
+        bench.alarm();
+    }
+    assert!(alarms < 100, "{alarms} alarms in 20 ms");
+    assert_eq!(bench.send_one(CAN1), Some(numbered(7)));
+}
+
 #[test]
 fn confirmations_survive_a_host_that_does_not_read() {
     let queue = Queue::new();

@@ -10,7 +10,7 @@ use cantap_wire::message::ChannelStatus;
 use cantap_wire::record::{BusErrorKind, ErrorState, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel};
 
-use crate::bits::FrameBits;
+use crate::bits::bits_on_bus;
 use crate::device::{Records, Transmission};
 use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
 
@@ -133,7 +133,7 @@ impl Seen {
                 self.went_off_since = false;
             }
             TraceEvent::Frame { frame, .. } => {
-                self.others_since.add(record.time_ns, FrameBits::of(&frame).total());
+                self.others_since.add(record.time_ns, bits_on_bus(&frame));
             }
             TraceEvent::BusError { kind, .. } => {
                 self.errors.add(kind);
@@ -375,7 +375,7 @@ mod tests {
         let others = frame(Direction::Rx, text);
         // A quarter of each millisecond is not full.
         assert_eq!(cause(seen(&[others; 200], &[]), true), Cause::Unknown);
-        let length_ns = i64::from(FrameBits::of(&text.parse().unwrap()).total()) * 2_000;
+        let length_ns = i64::from(bits_on_bus(&text.parse().unwrap())) * 2_000;
         let mut full = Seen::default();
         for at in 0..1000 {
             full.push(&TraceRecord { time_ns: at * length_ns, channel: 1, event: others });

@@ -8,6 +8,7 @@
 pub(crate) mod hearing;
 #[cfg(all(test, feature = "virtual"))]
 mod on_the_virtual_device;
+mod rates;
 
 use std::time::Duration;
 
@@ -16,6 +17,7 @@ use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{BitTiming, Channel, Command, Frame};
 
 use self::hearing::Bounds;
+use self::rates::{clocks_of, next_to_study, round_rates, scan_rates, sharpest};
 use crate::device::Records;
 use crate::{Device, DeviceError, Direction, TraceEvent, bits_on_bus};
 
@@ -40,8 +42,6 @@ const STUDY_FRAMES: u32 = 8;
 const PATIENCE: Duration = Duration::from_secs(2);
 /// How often the device is asked.
 const ASK_EVERY: Duration = Duration::from_millis(2);
-/// The scan's step: near enough that one of two neighbours is heard.
-const SCAN_STEP: f64 = 1.007;
 /// Rates nearer than this cannot be told apart by listening, and need not be.
 const SAME: f64 = 0.005;
 /// Frames of one rate that are measured.
@@ -213,19 +213,6 @@ pub fn search(
     }
 }
 
-/// Every reachable rate, thinned to one in each [`SCAN_STEP`], from the fastest down.
-fn scan_rates(clock_hz: u32) -> Vec<u32> {
-    let mut rates: Vec<u32> = Vec::new();
-    for clocks in (clock_hz / MAX_BITRATE_BPS).max(1)..=clock_hz / MIN_BITRATE_BPS {
-        let rate = f64::from(clock_hz) / f64::from(clocks);
-        let far = rates.last().is_none_or(|last| f64::from(*last) / rate >= SCAN_STEP);
-        if far && BitTiming::of_clocks(clocks).next().is_some() {
-            rates.push(rate.round() as u32);
-        }
-    }
-    rates
-}
-
 impl Search<'_> {
     fn try_all(
         &mut self,
@@ -243,7 +230,7 @@ impl Search<'_> {
                 return Ok(Some(Outcome::NoTraffic));
             }
             let Ok(timing) = self.device.timing(bitrate_bps) else { continue };
-            let heard = self.find(timing, dwell)?;
+            let heard = self.find(timing, Purpose::Find, dwell)?;
             self.errors += u64::from(heard.errors);
             self.heard |= heard.frames + heard.errors > 0;
             if heard.is_good()
@@ -260,18 +247,8 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
-    /// Listens with a timing whether it is the right one.
-    fn find(&mut self, timing: BitTiming, dwell: Duration) -> Result<Heard, DeviceError> {
-        self.find_by(timing, Purpose::Find, dwell)
-    }
-
-    /// As [`Self::find`], for a purpose of one's own.
-    fn find_by(
-        &mut self,
-        timing: BitTiming,
-        purpose: Purpose,
-        dwell: Duration,
-    ) -> Result<Heard, DeviceError> {
+    /// Listens with a timing whether it is the right one. Where there are frames and errors, again, to weigh them.
+    fn find(&mut self, timing: BitTiming, purpose: Purpose, dwell: Duration) -> Result<Heard, DeviceError> {
         let heard = self.listen(timing, purpose, dwell)?;
         if heard.frames > 0 && heard.errors > 0 {
             self.listen(timing, Purpose::Weigh, dwell)
@@ -374,7 +351,7 @@ impl Search<'_> {
         if COMMON_BPS.contains(&candidate_bps)
             && !too_slow
             && let Some(timing) = sharpest(clocks_of(clock_hz, rate))
-            && self.find_by(timing, Purpose::Doubt { frames: SHARP_FRAMES }, dwell)?.is_good()
+            && self.find(timing, Purpose::Doubt { frames: SHARP_FRAMES }, dwell)?.is_good()
             && !self.is_slower_than(rate, dwell)?
         {
             return Ok(self.found(candidate_bps, heard));
@@ -416,7 +393,7 @@ impl Search<'_> {
             return Ok(Some(Outcome::NoMatch { errors: self.errors, about_bps: Some(middle) }));
         }
         for bitrate_bps in candidates.into_iter().flatten() {
-            let heard = self.find(self.device.timing(bitrate_bps)?, dwell)?;
+            let heard = self.find(self.device.timing(bitrate_bps)?, Purpose::Find, dwell)?;
             if heard.is_good() {
                 return Ok(self.found(bitrate_bps, heard));
             }
@@ -482,63 +459,4 @@ enum Purpose {
     },
     /// It may be near: which frames are heard, and which are not?
     Study,
-}
-
-/// Controller clocks per bit, rounded.
-fn clocks_of(clock_hz: u32, rate: f64) -> u32 {
-    (f64::from(clock_hz) / rate).round() as u32
-}
-
-/// The rates between the bounds that the clock reaches exactly and that are whole kilobits, but for the common ones: what leads
-/// here is none of those.
-fn round_rates(clock_hz: u32, bounds: &Bounds) -> impl Iterator<Item = u32> {
-    let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS)) as u32 / 1000;
-    let most = bounds.most_bps.min(f64::from(MAX_BITRATE_BPS)) as u32 / 1000;
-    let inside = bounds.least_bps..=bounds.most_bps;
-    (least..=most)
-        .map(|kbps| kbps * 1000)
-        .filter(move |bps| inside.contains(&f64::from(*bps)) && !COMMON_BPS.contains(bps))
-        .filter(move |bps| {
-            clock_hz.is_multiple_of(*bps) && BitTiming::of_clocks(clock_hz / bps).next().is_some()
-        })
-}
-
-/// The timing that takes the least of other rates: the latest sample point for a bus that is faster, and the shortest jump for one
-/// that is slower.
-fn sharpest(clocks: u32) -> Option<BitTiming> {
-    BitTiming::of_clocks(clocks)
-        .max_by_key(|timing| (timing.sample_point_permille(), timing.quanta()))
-        .map(|timing| BitTiming { jump_width: 1, ..timing })
-}
-
-/// The reachable rate, in clocks per bit, that tells most: the one nearest to the middle of the bounds and not too near
-/// to one that was studied.
-fn next_to_study(clock_hz: u32, bounds: &Bounds, tried: &[u32]) -> Option<u32> {
-    let middle = bounds.middle_bps()?;
-    let rate = |clocks: u32| f64::from(clock_hz) / f64::from(clocks);
-    let most = bounds.most_bps.min(f64::from(MAX_BITRATE_BPS));
-    let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS));
-    (clocks_of(clock_hz, most).max(1)..=clocks_of(clock_hz, least))
-        .filter(|clocks| {
-            (least..=most).contains(&rate(*clocks)) && BitTiming::of_clocks(*clocks).next().is_some()
-        })
-        .filter(|clocks| tried.iter().all(|near| (rate(*near) / rate(*clocks) - 1.0).abs() > SAME / 2.0))
-        .min_by(|a, b| (rate(*a) - middle).abs().total_cmp(&(rate(*b) - middle).abs()))
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn the_scan_leaves_no_gap_that_a_rate_could_hide_in() {
-        let rates = scan_rates(36_000_000);
-        assert_eq!(rates.first(), Some(&1_000_000));
-        assert!(rates.iter().all(|rate| (5_000..=1_000_000).contains(rate)));
-        // Fast rates have few dividers: there the clock itself sets the steps.
-        for pair in rates.windows(2).filter(|pair| pair[0] < 300_000) {
-            assert!(f64::from(pair[0]) / f64::from(pair[1]) < 1.03, "{pair:?}");
-        }
-        assert!(rates.len() < 800, "{}", rates.len());
-    }
 }

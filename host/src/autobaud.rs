@@ -5,7 +5,7 @@
 //! as it can be, where 1.5 % are too much; and for any other the rates around are listened to, until the frames themselves tell
 //! how fast the bus is (`hearing.rs`).
 
-pub(crate) mod hearing;
+mod hearing;
 #[cfg(all(test, feature = "virtual"))]
 mod on_the_virtual_device;
 mod rates;

@@ -87,13 +87,6 @@ impl Bounds {
     }
 }
 
-/// Whether a controller of `clock_hz` with `timing` receives a frame from a bus of this rate.
-#[cfg(feature = "virtual")]
-pub(crate) fn is_heard(frame: &Frame, timing: BitTiming, clock_hz: u32, bus_bps: u32) -> bool {
-    let own_bps = f64::from(clock_hz) / f64::from(timing.clocks_per_bit());
-    hears(&levels(frame), timing, f64::from(bus_bps) / own_bps, PHASES[0])
-}
-
 /// Whether a receiver takes these bits if the bus is `rate` times as fast as itself and it saw the start of frame `phase`
 /// quanta late.
 fn hears(levels: &[bool], timing: BitTiming, rate: f64, phase: f64) -> bool {

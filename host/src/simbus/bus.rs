@@ -18,8 +18,6 @@ const NEVER: u64 = u64::MAX;
 pub trait Node {
     /// Its bit rate in bit/s, while it takes part in the bus.
     fn bitrate_bps(&self) -> Option<u32>;
-    /// Whether it takes a frame of a bus with this bit rate without an error.
-    fn hears(&self, frame: &Frame, bus_bps: u32) -> bool;
     /// The frame that it wants to send.
     fn bid(&self) -> Option<Frame>;
     /// Whether it acknowledges others' frames.
@@ -152,7 +150,7 @@ impl SimBus {
         let bits = FrameBits::of(&frame);
         let at = |bits: u64| now_ns + bits * 1_000_000_000 / u64::from(bitrate_bps.max(1));
         let whole = u64::from(bits.total() - INTERMISSION_BITS);
-        let error = self.fate(&frame, sender, bitrate_bps, nodes);
+        let error = self.fate(sender, bitrate_bps, nodes);
         let (end, free) = match error {
             None => (whole, whole + u64::from(INTERMISSION_BITS)),
             Some(BusErrorKind::Acknowledgment) => {
@@ -170,7 +168,6 @@ impl SimBus {
     /// What will become of a frame.
     fn fate(
         &mut self,
-        frame: &Frame,
         sender: Option<usize>,
         bitrate_bps: u32,
         nodes: &[&mut dyn Node],
@@ -184,7 +181,8 @@ impl SimBus {
             let kind = if left % 2 == 0 { BusErrorKind::BitDominant } else { BusErrorKind::BitRecessive };
             return Some(kind);
         }
-        let in_step = |node: &&mut dyn Node| node.bitrate_bps().is_some() && node.hears(frame, bitrate_bps);
+        let in_step =
+            |node: &&mut dyn Node| node.bitrate_bps().is_some_and(|own| same_rate(own, bitrate_bps));
         let node_acknowledges = nodes
             .iter()
             .enumerate()
@@ -208,7 +206,7 @@ impl SimBus {
         for (index, node) in nodes.iter_mut().enumerate() {
             let own = Some(index) == sender;
             match (node.bitrate_bps(), bitrate_bps) {
-                (Some(_), Some(rate)) if own || node.hears(frame, rate) => match error {
+                (Some(own_rate), Some(rate)) if own || same_rate(own_rate, rate) => match error {
                     None => node.on_frame(frame, own),
                     // A receiver sees the sender's error flag where the end of frame should be.
                     Some(BusErrorKind::Acknowledgment) if !own => node.on_error(BusErrorKind::Form, false),
@@ -226,6 +224,11 @@ fn join_and_leave(nodes: &mut [&mut dyn Node]) {
     for node in nodes {
         node.on_boundary();
     }
+}
+
+/// Within the tolerance of any two controllers: 1 %.
+fn same_rate(a: u32, b: u32) -> bool {
+    u64::from(a.abs_diff(b)) * 100 <= u64::from(b)
 }
 
 /// What arbitration compares, bit by bit; 0 wins.
@@ -263,9 +266,6 @@ mod tests {
     impl Node for FakeNode {
         fn bitrate_bps(&self) -> Option<u32> {
             Some(self.bitrate_bps)
-        }
-        fn hears(&self, _: &Frame, bus_bps: u32) -> bool {
-            self.bitrate_bps == bus_bps
         }
         fn bid(&self) -> Option<Frame> {
             self.bid

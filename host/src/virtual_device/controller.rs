@@ -14,7 +14,6 @@ use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 
-use crate::autobaud::hearing::is_heard;
 use crate::simbus::Node;
 
 /// Frames that a receive FIFO holds (RM0090 Rev 21 §32.7.3).
@@ -208,12 +207,6 @@ impl Controller {
 impl Node for Controller {
     fn bitrate_bps(&self) -> Option<u32> {
         (self.phase != Phase::Off && self.state() != ErrorState::BusOff).then_some(self.bitrate_bps)
-    }
-
-    fn hears(&self, frame: &Frame, bus_bps: u32) -> bool {
-        let timing = self.config.map(|config| config.timing);
-        self.bitrate_bps == bus_bps
-            || timing.is_some_and(|timing| is_heard(frame, timing, CAN_CLOCK_HZ, bus_bps))
     }
 
     fn bid(&self) -> Option<Frame> {

@@ -1,7 +1,7 @@
-//! What the highest-priority interrupts do: receive, transmit, errors, alarm.
+//! What the tasks of priority 4 do: drain the FIFOs, confirm, record errors, send what is due.
 //!
-//! The receive interrupt stamps before anything else. A single frame in the FIFO is the one that raised the
-//! interrupt, so its stamp is its end plus the interrupt's latency. Frames found queued behind one
+//! The receive interrupt, one priority higher, only reads the stamp timer. A single frame in the FIFO is the one that raised
+//! the interrupt, so its stamp is its end plus the interrupt's latency. Frames found queued behind one
 //! another, or while the FIFO is being drained, ended at unknown times before now: their stamp says so, and
 //! the host tightens it.
 
@@ -15,6 +15,7 @@ use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 use crate::queue::Producer;
 use crate::recorder::Recorder;
+use crate::sof::SofMark;
 use crate::transmit::{NEVER, Transmitter};
 
 /// An alarm is never set farther ahead than this, a quarter of the timer's range; it is set again then.
@@ -125,11 +126,12 @@ impl<'q, const N: usize> Capture<'q, N> {
         entered: u32,
     ) {
         let ended = self.recorder.time(entered);
+        let patience = ended + Self::patience_ticks::<C>();
         let state = &mut self.channels[channel.index()];
         state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason);
         // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
         // than there is.
-        self.load_in_time(traffic, clock);
+        self.load_in_time(traffic, clock, patience);
         let state = &mut self.channels[channel.index()];
         let recorded = state.transmitter.record(&mut self.recorder, ended);
         let now = self.recorder.time(clock.now());
@@ -137,19 +139,27 @@ impl<'q, const N: usize> Capture<'q, N> {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);
         }
         // That took a while, and the other channel's turn may come next: the alarm would be too late.
-        self.load_in_time(traffic, clock);
+        self.load_in_time(traffic, clock, patience);
         self.arm(clock);
     }
 
-    /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it. All but the
-    /// request itself is done ahead, so that two frames due at one moment leave at one moment.
-    fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
+    /// For so long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
+    /// for, and one that is due soon after it on the other channel, leave in time. For what is due later the alarm is set
+    /// again, which takes less than half that time: the tasks that drain the FIFOs come before it.
+    const fn patience_ticks<C: Clock>() -> u64 {
+        2 * C::ALARM_EARLY_TICKS as u64
+    }
+
+    /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it: until `patience`
+    /// ends, and after that only from one frame to the next while they are half an early alarm apart; the mailboxes take six. All
+    /// but the request itself is done ahead, so that two frames due at one moment leave at one moment.
+    fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, patience: u64) {
         let early = u64::from(C::ALARM_EARLY_TICKS);
         loop {
             let now = self.recorder.time(clock.now());
             let heads = self.due(Transmitter::head_due);
             let next = heads[0].min(heads[1]);
-            if next > now + early {
+            if next > (now + early).min(patience).max(now + early / 2) {
                 return;
             }
             // What is due soon after it would find no time for this between the two. A periodic frame is not waited past; one that
@@ -191,11 +201,12 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// The alarm: something is due for transmission.
     pub fn on_alarm<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C) {
-        self.load_in_time(traffic, clock);
+        let patience = self.recorder.time(clock.now()) + Self::patience_ticks::<C>();
+        self.load_in_time(traffic, clock, patience);
         let mut now = self.recorder.time(clock.now());
         let [first, second] = self.due(Transmitter::periodic_due);
         let due = first.min(second);
-        if due > now && due - now <= u64::from(C::ALARM_EARLY_TICKS) {
+        if due > now && due <= patience.min(now + u64::from(C::ALARM_EARLY_TICKS)) {
             clock.wait_until(due as u32);
             now = self.recorder.time(clock.now());
         }
@@ -207,7 +218,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             }
         }
         if serviced {
-            self.load_in_time(traffic, clock);
+            self.load_in_time(traffic, clock, patience);
         }
         self.arm(clock);
     }
@@ -217,6 +228,12 @@ impl<'q, const N: usize> Capture<'q, N> {
         for channel in Channel::ALL {
             self.on_channel_tick(channel, &mut traffic[channel.index()], clock);
         }
+    }
+
+    /// A USB frame has started.
+    pub fn on_sof(&mut self, mark: SofMark) {
+        let at = self.recorder.time(mark.at);
+        self.recorder.aside(&mark.event, at);
     }
 
     /// One channel's part of [`Self::on_tick`], for where the alarm must be able to come between the two.
@@ -231,19 +248,22 @@ impl<'q, const N: usize> Capture<'q, N> {
         Self::give_up_when_off(state, traffic, &mut self.recorder, now);
         // Mailboxes that finish meanwhile are left to the interrupt, which knows when.
         state.transmitter.service(traffic, &mut self.recorder, now);
+        state.transmitter.tick(&mut self.recorder, now);
         self.recorder.tick(now);
         self.arm(clock);
     }
 
-    /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame.
+    /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait.
     fn give_up_when_off(
         state: &mut ChannelState,
         traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
     ) {
-        let off = state.errors.status().state == ErrorState::BusOff;
-        if off && state.open.is_some_and(|config| config.manual_recovery) && state.transmitter.pending() > 0 {
+        let off = state.errors.status().state == ErrorState::BusOff
+            && state.open.is_some_and(|config| config.manual_recovery);
+        state.transmitter.set_off(off);
+        if off && state.transmitter.pending() > 0 {
             state.abort_reason = TransmitFailure::BusOff;
             state.transmitter.drop_all(TransmitFailure::BusOff, traffic);
             state.transmitter.on_finished(traffic, recorder, now, state.abort_reason);
@@ -305,7 +325,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let now = self.now(clock);
         let state = &mut self.channels[channel.index()];
         state.abort_reason = TransmitFailure::Closed;
-        state.transmitter.clear_entries();
+        state.transmitter.clear_entries(now);
         state.transmitter.drop_all(TransmitFailure::Closed, traffic);
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
     }
@@ -326,11 +346,13 @@ impl<'q, const N: usize> Capture<'q, N> {
         let state = &mut self.channels[channel.index()];
         state.transmitter.on_finished(traffic, &mut self.recorder, now, state.abort_reason);
         if overdue {
-            state.transmitter.give_up_mailboxes(&mut self.recorder, now, state.abort_reason);
+            state.transmitter.give_up_mailboxes(traffic, &mut self.recorder, now, state.abort_reason);
         }
+        let all_told = state.transmitter.tell_rest(&mut self.recorder, now);
         state.errors.flush(&mut self.recorder, now);
         self.recorder.flush_losses(now);
-        if !state.transmitter.is_idle() || !self.recorder.event(&Event::Stopped { channel }, now) {
+        if !all_told || !state.transmitter.is_idle() || !self.recorder.event(&Event::Stopped { channel }, now)
+        {
             return false;
         }
         state.open = None;
@@ -383,8 +405,10 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// The channel's part of the status.
-    pub fn status(&self, channel: Channel) -> ChannelStatus {
-        let state = &self.channels[channel.index()];
+    pub fn status(&mut self, channel: Channel, clock: &impl Clock) -> ChannelStatus {
+        let now = self.now(clock);
+        let state = &mut self.channels[channel.index()];
+        state.transmitter.count_overtaken(now);
         let errors = state.errors.status();
         let (transmitted, transmit_failures) = state.transmitter.counters();
         ChannelStatus {

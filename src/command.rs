@@ -7,8 +7,9 @@ use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, 
 use heapless::{String, Vec};
 
 use crate::filters::{BANKS, Layout};
+use crate::periodic::PERIODIC_SLOTS;
 use crate::ports::{Board, Chip, Control, FilterBanks};
-use crate::transmit::{PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
+use crate::transmit::{TRIGGER_SLOTS, TX_QUEUE};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
 mod sending;
@@ -22,6 +23,9 @@ use settings::{ChannelSettings, saved, store};
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After so long the
 /// bus is stuck, and the controller is made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
+/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, looks every 10 ms). After so long it
+/// has no clock, or is broken.
+const HALT_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Time for the answer to reach the host before the device restarts.
 const LEAVE_AFTER_TICKS: u32 = 50 * TICKS_PER_MS;
 
@@ -39,6 +43,8 @@ pub struct Identity {
 pub enum Work {
     /// Both channels leave the bus and everything is forgotten: a session begins or ends.
     Silence,
+    /// Both channels leave the bus and say so in the stream, which is kept: the host sleeps.
+    Retreat,
     /// A channel joins the bus.
     Open(Channel, ChannelConfig),
     /// A channel leaves the bus and says so in the stream.
@@ -65,6 +71,8 @@ pub struct Commands {
     identity: Identity,
     layout: Layout,
     settings: [ChannelSettings; CHANNELS],
+    /// Controllers that are being made to leave their bus.
+    halting: [bool; CHANNELS],
     /// When the work under way was begun.
     begun: u32,
     /// Requests that could not be read.
@@ -75,7 +83,14 @@ impl Commands {
     /// Nothing set.
     pub const fn new(identity: Identity) -> Self {
         const NOTHING: ChannelSettings = ChannelSettings { config: None, filters: Vec::new() };
-        Self { identity, layout: Layout::open(), settings: [NOTHING; CHANNELS], begun: 0, bad_requests: 0 }
+        Self {
+            identity,
+            layout: Layout::open(),
+            settings: [NOTHING; CHANNELS],
+            halting: [false; CHANNELS],
+            begun: 0,
+            bad_requests: 0,
+        }
     }
 
     /// What [`Command::Hello`] answers.
@@ -145,6 +160,7 @@ impl Commands {
             Command::Defaults { channel } => {
                 Reply::Defaults(saved(channel, board).ok_or(Refusal::NothingSaved)?)
             }
+            Command::Failures => Reply::Failures(board.chip().failures()),
         };
         Ok(Step::Done(reply))
     }
@@ -161,8 +177,18 @@ impl Commands {
                     board.control(channel).stop();
                 }
             }
-            Work::Close(channel) | Work::Recover(channel) => board.control(channel).stop(),
-            Work::Open(..) | Work::Restart | Work::Bootloader => {}
+            Work::Retreat => {
+                for channel in Channel::ALL {
+                    if is_open(channel, board) {
+                        begin_close(channel, board);
+                    }
+                    board.control(channel).stop();
+                }
+            }
+            Work::Open(channel, _) | Work::Close(channel) | Work::Recover(channel) => {
+                board.control(channel).stop();
+            }
+            Work::Restart | Work::Bootloader => {}
         }
         Step::Begun(work)
     }
@@ -176,17 +202,26 @@ impl Commands {
         let waited = board.now().wrapping_sub(self.begun);
         match work {
             Work::Silence => {
-                for channel in Channel::ALL {
-                    if !stopped(channel, waited, board) {
-                        return None;
-                    }
+                // Both are looked after, also when one does not follow.
+                let leave = Channel::ALL.map(|channel| self.leave(channel, waited, board));
+                if leave.iter().any(Option::is_none) {
+                    return None;
                 }
                 self.forget(board);
-                Some(Ok(Reply::Hello(self.hello())))
+                let refused = leave.into_iter().flatten().find_map(Result::err);
+                Some(refused.map_or_else(|| Ok(Reply::Hello(self.hello())), Err))
+            }
+            Work::Retreat => {
+                // As for silence.
+                let closed = Channel::ALL.map(|channel| self.leave_and_close(channel, waited, board));
+                if closed.iter().any(Option::is_none) {
+                    return None;
+                }
+                Some(closed.into_iter().flatten().find_map(Result::err).map_or(Ok(Reply::Done), Err))
             }
             Work::Open(channel, config) => {
-                if !stopped(channel, waited, board) {
-                    return None;
+                if let Err(refusal) = self.leave(channel, waited, board)? {
+                    return Some(Err(refusal));
                 }
                 board.with_capture(|capture, _, clock| capture.open(channel, config, clock));
                 board.control(channel).start(&config);
@@ -194,21 +229,18 @@ impl Commands {
                 Some(Ok(Reply::Opened(config)))
             }
             Work::Close(channel) => {
-                if !stopped(channel, waited, board) {
-                    return None;
-                }
-                board
-                    .with_capture(|capture, traffic, clock| {
-                        let overdue = waited > STOP_WITHIN_TICKS;
-                        capture.finish_close(channel, &mut traffic[channel.index()], clock, overdue)
-                    })
-                    .then_some(Ok(Reply::Done))
+                self.leave_and_close(channel, waited, board).map(|closed| closed.map(|()| Reply::Done))
             }
             Work::Recover(channel) => {
-                if !stopped(channel, waited, board) {
-                    return None;
+                let halted = self.halting[channel.index()];
+                if let Err(refusal) = self.leave(channel, waited, board)? {
+                    return Some(Err(refusal));
                 }
-                board.control(channel).resume();
+                let config = board.with_capture(|capture, _, _| capture.config(channel).copied());
+                match config.filter(|_| halted) {
+                    Some(config) => board.control(channel).start(&config),
+                    None => board.control(channel).resume(),
+                }
                 Some(Ok(Reply::Done))
             }
             Work::Restart | Work::Bootloader => {
@@ -223,6 +255,49 @@ impl Commands {
                 Some(Ok(Reply::Done))
             }
         }
+    }
+
+    /// Whether a channel has left the bus; after too long it is made to. `None` while it is under way.
+    fn leave<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        waited: u32,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<Result<(), Refusal>> {
+        let halting = &mut self.halting[channel.index()];
+        if !board.control(channel).is_stopped() && waited > STOP_WITHIN_TICKS {
+            *halting = true;
+            board.control(channel).halt();
+        }
+        if board.control(channel).is_stopped() {
+            if core::mem::take(halting) {
+                board.filters().write(&self.layout);
+            }
+            return Some(Ok(()));
+        }
+        let overdue = waited > STOP_WITHIN_TICKS + HALT_WITHIN_TICKS;
+        overdue.then(|| {
+            *halting = false;
+            Err(Refusal::Hardware)
+        })
+    }
+
+    /// As [`Self::leave`]; a channel that was open has said its last word too.
+    fn leave_and_close<'q, const N: usize>(
+        &mut self,
+        channel: Channel,
+        waited: u32,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<Result<(), Refusal>> {
+        if let Err(refusal) = self.leave(channel, waited, board)? {
+            return Some(Err(refusal));
+        }
+        let closed = !is_open(channel, board)
+            || board.with_capture(|capture, traffic, clock| {
+                let overdue = waited > STOP_WITHIN_TICKS;
+                capture.finish_close(channel, &mut traffic[channel.index()], clock, overdue)
+            });
+        closed.then_some(Ok(()))
     }
 
     /// Both channels have left the bus: nothing of the last session remains.
@@ -294,9 +369,7 @@ impl Commands {
         if !is_open(channel, board) {
             return Step::Done(Reply::Done);
         }
-        board.with_capture(|capture, traffic, clock| {
-            capture.begin_close(channel, &mut traffic[channel.index()], clock);
-        });
+        begin_close(channel, board);
         self.begin(Work::Close(channel), board)
     }
 
@@ -305,7 +378,7 @@ impl Commands {
         channel: Channel,
         board: &mut impl Board<'q, N>,
     ) -> Result<Step, Refusal> {
-        let status = board.with_capture(|capture, _, _| capture.status(channel));
+        let status = board.with_capture(|capture, _, clock| capture.status(channel, clock));
         if status.open.is_none() {
             return Err(Refusal::ChannelClosed);
         }
@@ -343,8 +416,8 @@ impl Commands {
     fn status<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Status {
         let (ticks, fill) = board.with_capture(|capture, _, clock| (capture.now(clock), capture.fill()));
         // One channel a time, to hold the interrupts up for less.
-        let channels =
-            Channel::ALL.map(|channel| board.with_capture(|capture, _, _| capture.status(channel)));
+        let channels = Channel::ALL
+            .map(|channel| board.with_capture(|capture, _, clock| capture.status(channel, clock)));
         let chip = board.chip();
         Status {
             ticks,
@@ -410,11 +483,8 @@ fn is_open<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) 
     board.with_capture(|capture, _, _| capture.config(channel).is_some())
 }
 
-/// Whether a channel has left the bus; after too long it is made to.
-fn stopped<'q, const N: usize>(channel: Channel, waited: u32, board: &mut impl Board<'q, N>) -> bool {
-    let control = board.control(channel);
-    if !control.is_stopped() && waited > STOP_WITHIN_TICKS {
-        control.halt();
-    }
-    control.is_stopped()
+fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) {
+    board.with_capture(|capture, traffic, clock| {
+        capture.begin_close(channel, &mut traffic[channel.index()], clock);
+    });
 }

@@ -10,6 +10,20 @@ const ERROR_FOR_MS: u16 = 1_000;
 /// Half a period of the pattern that shows where the device is, in ms.
 const IDENTIFY_MS: u16 = 60;
 
+/// A flash of the pattern for a clock that does not start, and the pause to the next, in ms.
+const NO_CLOCK_FLASH_MS: u32 = 100;
+/// Flashes of that pattern.
+const NO_CLOCK_FLASHES: u32 = 3;
+/// Its period in ms: the flashes, then dark for longer than any other pattern is.
+pub const NO_CLOCK_MS: u32 = 1_500;
+
+/// The pattern for a clock that does not start, so that nothing but it runs: three short flashes and a second in the dark.
+pub const fn no_clock(at_ms: u32) -> Lit {
+    let half = at_ms % NO_CLOCK_MS / NO_CLOCK_FLASH_MS;
+    let flash = half < 2 * NO_CLOCK_FLASHES && half.is_multiple_of(2);
+    Lit { power: flash, traffic: false, error: false }
+}
+
 /// What happened in the last millisecond.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Activity {
@@ -121,6 +135,17 @@ mod tests {
         lights.identify(2);
         assert!(turns(&mut lights, 2000, FRAME, Lit::single) >= 15);
         assert!(lights.tick(QUIET).power && lights.identify_left_ms == 0);
+    }
+
+    #[test]
+    fn a_clock_that_does_not_start_flashes_three_times_in_a_period() {
+        let lit: Vec<bool> = (0..2 * NO_CLOCK_MS).map(|at_ms| no_clock(at_ms).power).collect();
+        assert_eq!(lit.iter().filter(|&&lit| lit).count() as u32, 2 * NO_CLOCK_FLASHES * NO_CLOCK_FLASH_MS);
+        // The first begins at once.
+        assert_eq!(
+            lit.windows(2).filter(|pair| !pair[0] && pair[1]).count() as u32,
+            2 * NO_CLOCK_FLASHES - 1
+        );
     }
 
     #[test]

@@ -7,9 +7,11 @@
 //! | 2 | USB, the millisecond tick | a host can be told to wait |
 //! | – | idle | sleeps |
 //!
-//! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock.
-//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI and so never holds up a stamp. The
-//! USB driver masks all interrupts inside its `poll` and packet writes; `docs/benchmarks.md` tells for how long.
+//! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock. Of those that wait, the
+//! lowest vector goes first (Armv7-M architecture reference manual, "Exception number and priority"): at priority 4 the two that drain
+//! have the lowest, so that transmission, however much of it a host asks for, never goes before capture.
+//! Priority 2 reaches what priority 4 owns by RTIC's lock, which raises BASEPRI and so never holds up a stamp. Nothing masks
+//! priority 5: all of USB runs at priority 2, with a driver that needs no mask (`hw/usb`).
 #![cfg_attr(target_os = "none", no_std, no_main)]
 
 #[cfg(target_os = "none")]
@@ -92,8 +94,18 @@ mod app {
     #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
     fn init(cx: init::Context) -> (Shared, Local) {
         let hardware = hw::start(cx.device, cx.local.usb_memory);
-        let Hardware { can, stamp, tick, usb, mut chip, watchdog, identity, restarted_after_failure } =
-            hardware;
+        let Hardware {
+            can,
+            stamp,
+            sof,
+            tick,
+            crc,
+            usb,
+            mut chip,
+            watchdog,
+            identity,
+            restarted_after_failure,
+        } = hardware;
         chip.tick(Activity { error: restarted_after_failure, ..Activity::default() });
         let [can1_doorbell, can2_doorbell] = can.doorbells;
         let [can1_reopener, can2_reopener] = can.reopeners;
@@ -111,7 +123,7 @@ mod app {
                 can2_sent_at: AtomicU32::new(0),
                 session: Session::new(consumer, identity),
                 usb,
-                controls: Controls { can: can.control, filters, chip, stamp },
+                controls: Controls { can: can.control, filters, chip, stamp, sof, crc },
             },
             Local {
                 tick,
@@ -138,7 +150,7 @@ mod app {
     /// Stamps the end of a frame on CAN1, and leaves the frame to [`can1_drain`].
     ///
     /// Priority 5, the highest, and a dozen instructions: each microsecond of delay is one in the stamp. What can delay it is
-    /// [`can2_rx0`], and the USB driver, which masks all interrupts for a packet's length.
+    /// [`can2_rx0`] and the two transmit interrupts, a dozen instructions each.
     #[task(binds = CAN1_RX0, priority = 5, local = [can1_clock, can1_doorbell], shared = [&can1_entered])]
     fn can1_rx0(cx: can1_rx0::Context) {
         cx.shared.can1_entered.store(cx.local.can1_clock.now(), Ordering::Relaxed);
@@ -151,7 +163,7 @@ mod app {
     fn can2_rx0(cx: can2_rx0::Context) {
         cx.shared.can2_entered.store(cx.local.can2_clock.now(), Ordering::Relaxed);
         cx.local.can2_doorbell.silence();
-        rtic::pend(Interrupt::CAN2_RX1);
+        rtic::pend(Interrupt::DMA1_STREAM0);
     }
 
     /// Moves frames from CAN1's FIFO 0 to the record queue. FIFO 1 is not used, and its interrupt raises this task.
@@ -167,8 +179,9 @@ mod app {
         cx.local.can1_reopener.open();
     }
 
-    /// As [`can1_drain`], for CAN2.
-    #[task(binds = CAN2_RX1, priority = 4, local = [can2_reopener], shared = [tap, &can2_entered])]
+    /// As [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
+    /// FIFO 1 is above those of the tasks that send, which would then go first.
+    #[task(binds = DMA1_STREAM0, priority = 4, local = [can2_reopener], shared = [tap, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
         let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
@@ -276,7 +289,9 @@ mod app {
         }
         let activity = tap.lock(|Tap { capture, .. }| capture.take_activity());
         controls.chip.tick(activity);
-        session.poll(usb, &mut Access { tap, controls });
+        let mut access = Access { tap, controls };
+        session.tick(&mut access);
+        session.poll(usb, &mut access);
     }
 
     /// Sleeps until the next interrupt.
@@ -284,6 +299,8 @@ mod app {
     fn idle(_: idle::Context) -> ! {
         loop {
             cortex_m::asm::wfi();
+            // A debugger keeps the clock on in sleep; see `hw::start`.
+            cortex_m::asm::isb();
         }
     }
 }

@@ -1,4 +1,4 @@
-//! Hands messages to the port, packet by packet.
+//! Hands messages to the port, transfer by transfer.
 
 use cantap_wire::framing::MAX_ENCODED;
 
@@ -41,21 +41,18 @@ impl Outbox {
         self.sent = 0;
     }
 
-    /// Hands packets to the port until it takes no more or all has gone.
+    /// Hands bytes to the port until it takes no more or all have gone.
     pub fn pump(&mut self, port: &mut impl Port) {
         while self.sent < self.len {
-            let end = self.len.min(self.sent + PACKET);
-            if !port.write(&self.bytes[self.sent..end]) {
-                return;
-            }
-            self.must_end = end - self.sent == PACKET;
-            self.sent = end;
+            let Some(taken) = port.write(&self.bytes[self.sent..self.len]) else { return };
+            self.must_end = taken.is_multiple_of(PACKET);
+            self.sent += taken;
         }
     }
 
     /// Nothing follows for now: ends the transfer with an empty packet if the last one was full (USB 2.0, 5.8.3).
     pub fn end(&mut self, port: &mut impl Port) {
-        if self.must_end && self.is_empty() && port.write(&[]) {
+        if self.must_end && self.is_empty() && port.write(&[]).is_some() {
             self.must_end = false;
         }
     }

@@ -1,15 +1,17 @@
 //! What the logic needs from hardware, as small traits: the board implements them over registers, tests
 //! and the virtual device with fakes.
 //!
-//! A CAN controller has two sides. [`Traffic`] is touched by the highest-priority interrupts only,
+//! A CAN controller has two sides. [`Traffic`] is touched by the tasks of priority 4 only,
 //! [`Control`] by commands only; the registers behind them are disjoint, so neither waits for the other.
 
-use cantap_wire::message::{ChannelConfig, RegisterSet};
+use cantap_wire::framing;
+use cantap_wire::message::{ChannelConfig, Failures, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{CHANNELS, Channel, Frame};
 
 use crate::capture::Capture;
 use crate::filters::Layout;
+use crate::sof::SofReading;
 
 /// The free-running stamp timer at [`crate::TICK_HZ`], with one alarm.
 pub trait Clock {
@@ -81,7 +83,9 @@ pub trait Traffic {
 pub trait Control {
     /// Asks the controller to leave the bus. It does so when the frame on the bus, if any, has ended.
     fn stop(&mut self);
-    /// Makes it leave the bus at once, even in the middle of a frame: for a bus that is stuck.
+    /// Makes it leave the bus at once, even in the middle of a frame: for a bus that is stuck. To be called again and again until
+    /// [`Self::is_stopped`]. It is a reset, behind which nothing is as it was written: the configuration, the filters of both
+    /// controllers, and perhaps not even the mailboxes' abort.
     fn halt(&mut self);
     /// Whether it has left the bus.
     fn is_stopped(&self) -> bool;
@@ -94,8 +98,8 @@ pub trait Control {
 
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
-    /// Writes all banks. Reception is interrupted, so no channel may be open unless the layout's shape
-    /// (split, modes, scales) is what it was and only closed channels' banks differ.
+    /// Writes what of the banks differs from the layout, as they are now. Reception is interrupted, so no channel may be open unless
+    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ.
     fn write(&mut self, layout: &Layout);
 }
 
@@ -105,6 +109,8 @@ pub trait Chip {
     fn temperature_decicelsius(&mut self) -> Option<i16>;
     /// Supply voltage in mV, if it can be measured.
     fn supply_millivolts(&mut self) -> Option<u16>;
+    /// How often the firmware failed since the chip got its power, and why last.
+    fn failures(&mut self) -> Failures;
     /// Shows a pattern on the LEDs for so long.
     fn identify(&mut self, seconds: u8);
     /// Restarts the firmware; on the board it does not return.
@@ -138,6 +144,12 @@ pub trait Board<'q, const N: usize> {
     ) -> R;
     /// The stamp timer now.
     fn now(&self) -> u32;
+    /// What the stamp timer has latched of USB's start of frame since the last call; nothing if none came.
+    fn take_sof(&mut self) -> Option<SofReading>;
+    /// The CRC of a message ([`cantap_wire::framing::crc32`]), by hardware where there is some.
+    fn crc32(&mut self, message: &[u8]) -> u32 {
+        framing::crc32(message)
+    }
     /// A channel's control side.
     fn control(&mut self, channel: Channel) -> &mut Self::Control;
     /// The acceptance filters.
@@ -150,15 +162,20 @@ pub trait Board<'q, const N: usize> {
 pub trait Port {
     /// Whether a host has the port open.
     fn is_open(&self) -> bool;
-    /// Hands over one packet of at most [`PACKET`] bytes; false if the last one is still waiting.
-    fn write(&mut self, packet: &[u8]) -> bool;
+    /// Whether the host has put the bus to sleep with the port open. It is not open meanwhile, and is again when the bus wakes.
+    fn is_suspended(&self) -> bool {
+        false
+    }
+    /// Hands over as many of these bytes as go in one transfer and returns how many: all of them, or whole packets of [`PACKET`].
+    /// `None` if the last transfer is still under way. No bytes are an empty packet.
+    fn write(&mut self, bytes: &[u8]) -> Option<usize>;
     /// Takes one packet and returns its length.
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize>;
     /// Makes the host wait with what it sends, or no longer. What is on its way still comes: at most [`ON_ITS_WAY`] packets.
     fn hold(&mut self, hold: bool);
 }
 
-/// Packets that may still come from a host that was told to wait.
-pub const ON_ITS_WAY: usize = 3;
+/// Packets that may still come from a host that was told to wait: those that were let in before.
+pub const ON_ITS_WAY: usize = 4;
 /// Largest packet of a full-speed bulk endpoint, in bytes (USB 2.0, 5.8.3).
 pub const PACKET: usize = 64;

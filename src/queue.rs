@@ -125,6 +125,11 @@ impl<const N: usize> Consumer<'_, N> {
         used
     }
 
+    /// Whether there is nothing in it.
+    pub fn is_empty(&mut self) -> bool {
+        self.ring.read().is_err()
+    }
+
     /// Drops everything. Nothing may be pushed meanwhile.
     pub fn clear(&mut self) {
         while self.read(<[u8]>::len) > 0 {}

@@ -8,10 +8,6 @@ use crate::QUEUE_BYTES;
 use crate::queue::{Kind, Producer};
 use crate::time::Timebase;
 
-/// A time mark is written when nothing else was for so many ticks, so that a time difference always
-/// fits an `i32`: half its range.
-const MARK_AFTER_TICKS: u64 = 1 << 30;
-
 /// The only writer of the queue. Lives in the highest-priority interrupts.
 pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
     producer: Producer<'q, N>,
@@ -78,6 +74,13 @@ impl<'q, const N: usize> Recorder<'q, N> {
         self.write(event, at)
     }
 
+    /// Writes an event that nobody misses: not while the queue takes no frames.
+    pub fn aside(&mut self, event: &Event, at: u64) {
+        if self.producer.takes_frames() {
+            self.event(event, at);
+        }
+    }
+
     fn write(&mut self, event: &Event, at: u64) -> bool {
         let difference = self.difference(at);
         let written = self.producer.push(Kind::Event, |room| encode_event(event, difference, room));
@@ -87,10 +90,10 @@ impl<'q, const N: usize> Recorder<'q, N> {
         written
     }
 
-    /// Ticks from the last record to `at`. They fit: see [`MARK_AFTER_TICKS`].
+    /// Ticks from the last record to `at`, however long ago that was.
     #[inline]
-    fn difference(&self, at: u64) -> i32 {
-        at.wrapping_sub(self.last_ticks) as i32
+    fn difference(&self, at: u64) -> i64 {
+        at.wrapping_sub(self.last_ticks) as i64
     }
 
     /// Writes a loss record for each channel that lost frames, once the queue takes frames again. It then
@@ -113,13 +116,16 @@ impl<'q, const N: usize> Recorder<'q, N> {
         }
     }
 
-    /// Once a millisecond while a session is on: reports losses that no later frame has reported, and
-    /// keeps time differences small.
+    /// Once a millisecond: reports losses that no later frame has reported.
     pub fn tick(&mut self, now: u64) {
-        self.report_losses(now);
-        if now.wrapping_sub(self.last_ticks) > MARK_AFTER_TICKS && now > self.last_ticks {
-            self.write(&Event::TimeMark, now);
+        if self.unreported != [0; CHANNELS] {
+            self.report_losses(now);
         }
+    }
+
+    /// Whether the queue has room for more than what explains that frames are missing.
+    pub fn takes_frames(&mut self) -> bool {
+        self.producer.takes_frames()
     }
 
     /// Frames of a channel that the queue lost since [`Self::restart`].

@@ -1,7 +1,9 @@
 //! Packs queued records into batches: walks whole records and keeps the running time, so that every
 //! batch carries an absolute time of its own.
 
+use cantap_wire::CHANNELS;
 use cantap_wire::batch::BatchWriter;
+use cantap_wire::message::EndReason;
 use cantap_wire::record::{self, Outline};
 
 use crate::TICKS_PER_MS;
@@ -34,12 +36,14 @@ impl Sender {
         self.full = false;
     }
 
-    /// Takes records from the queue; if a batch is due, writes it to `out`, encoded, and returns its length.
+    /// Takes records from the queue; if a batch is due, writes it to `out`, encoded, and returns its length. `crc32` makes its
+    /// CRC.
     pub fn next_batch<const N: usize>(
         &mut self,
         queue: &mut Consumer<'_, N>,
         now: u32,
         out: &mut [u8],
+        crc32: impl FnOnce(&[u8]) -> u32,
     ) -> usize {
         // The ring may be read in two pieces, before and after its wrap.
         while !self.full && queue.read(|bytes| self.take(bytes, now)) > 0 {}
@@ -48,30 +52,51 @@ impl Sender {
             return 0;
         }
         self.full = false;
-        self.batch.finish(out)
+        self.batch.finish_with(out, crc32)
+    }
+
+    /// Writes the end of the session to `out` and returns its length; 0 as long as there are records before it. It came at `at`.
+    pub fn end<const N: usize>(
+        &mut self,
+        queue: &mut Consumer<'_, N>,
+        reason: EndReason,
+        at: u64,
+        out: &mut [u8],
+    ) -> usize {
+        if self.batch.is_empty() && queue.is_empty() { self.batch.end(reason, at, out) } else { 0 }
     }
 
     /// Appends whole records until the batch is full and returns their length.
     fn take(&mut self, bytes: &[u8], now: u32) -> usize {
+        let room = self.batch.room();
+        let mut running_ticks = self.running_ticks;
+        let mut frames = [0; CHANNELS];
         let mut rest = bytes;
         while !rest.is_empty() {
             let Ok(Outline { len, ticks, frame_of }) = record::outline(rest) else {
                 // Cannot happen, since the recorder wrote it; if it did, the rest could not be read either.
-                rest = &[];
-                break;
+                return bytes.len();
             };
-            if self.batch.is_empty() {
-                self.started = now;
-            }
-            let (record, after) = rest.split_at(len);
-            if !self.batch.push(record, self.running_ticks, frame_of) {
+            if bytes.len() - rest.len() + len > room {
                 self.full = true;
                 break;
             }
-            self.running_ticks = self.running_ticks.wrapping_add_signed(i64::from(ticks));
-            rest = after;
+            if let Some(channel) = frame_of {
+                frames[channel.index()] += 1;
+            }
+            running_ticks = running_ticks.wrapping_add_signed(ticks);
+            rest = &rest[len..];
         }
-        bytes.len() - rest.len()
+        let taken = bytes.len() - rest.len();
+        if taken > 0 {
+            if self.batch.is_empty() {
+                self.started = now;
+            }
+            // Fits: it is no more than there was room for.
+            self.batch.append(&bytes[..taken], self.running_ticks, frames);
+            self.running_ticks = running_ticks;
+        }
+        taken
     }
 }
 

@@ -4,7 +4,7 @@
 //! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
 
 use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal};
-use cantap_wire::message::{read_send, why_unreadable};
+use cantap_wire::message::{EndReason, read_send, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request};
 
 use crate::QUEUE_BYTES;
@@ -16,6 +16,7 @@ use crate::ports::{Board, ON_ITS_WAY, PACKET, Port};
 use crate::queue::Consumer;
 use crate::sender::Sender;
 use crate::slcan::{Answer, Slcan};
+use crate::sof::SofMarks;
 
 /// Longest request on the wire, zero byte included.
 const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);
@@ -42,6 +43,17 @@ enum Origin {
     Device,
 }
 
+/// How far the device is with a session that ends because the host sleeps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Slept {
+    /// There is none, or its host knows.
+    No,
+    /// The channels leave their buses.
+    Leaving,
+    /// They had left at this time, and the host is to be told behind what is queued.
+    Since(u64),
+}
+
 /// Everything between the record queue and the port.
 pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     queue: Consumer<'q, N>,
@@ -52,7 +64,10 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     outbox: Outbox,
     language: Language,
     work: Option<(Work, Origin)>,
+    /// The host put the bus to sleep with the port open.
+    slept: Slept,
     answers: Answers,
+    marks: SofMarks,
     /// The request being handled, and the packet being read: kept here, because clearing them on the stack takes time.
     request: [u8; MAX_REQUEST_ENCODED],
     packet: [u8; PACKET],
@@ -70,7 +85,9 @@ impl<'q, const N: usize> Session<'q, N> {
             outbox: Outbox::new(),
             language: Language::Unknown,
             work: None,
+            slept: Slept::No,
             answers: Answers::new(),
+            marks: SofMarks::new(),
             request: [0; MAX_REQUEST_ENCODED],
             packet: [0; PACKET],
         }
@@ -81,9 +98,23 @@ impl<'q, const N: usize> Session<'q, N> {
         self.language != Language::Unknown
     }
 
+    /// Marks the start of a USB frame now and then. To be called every millisecond.
+    pub fn tick(&mut self, board: &mut impl Board<'q, N>) {
+        let reading = board.take_sof();
+        // Only a native session has a place for marks.
+        if matches!(self.language, Language::Native { greeted: true })
+            && let Some(mark) = self.marks.tick(reading)
+        {
+            board.with_capture(|capture, _, _| capture.on_sof(mark));
+        }
+    }
+
     /// Reads, works and writes as far as it goes without waiting. To be called at every USB interrupt and
     /// every millisecond.
     pub fn poll(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
+        if port.is_suspended() {
+            return self.fall_silent(board);
+        }
         if !port.is_open() {
             return self.hang_up(port, board);
         }
@@ -101,12 +132,36 @@ impl<'q, const N: usize> Session<'q, N> {
         self.outbox.end(port);
     }
 
+    /// The host sleeps with the port open: the channels leave their buses, and the session ends. What is queued stays, and so does
+    /// what the controller has taken of it: the host gets it when it wakes, and behind it the end.
+    fn fall_silent(&mut self, board: &mut impl Board<'q, N>) {
+        let in_session = match self.language {
+            Language::Unknown => false,
+            Language::Native { greeted } => greeted,
+            Language::Slcan => true,
+        };
+        // A session that is just beginning begins first, and a restart that was asked for comes.
+        let busy = matches!(self.work, Some((Work::Silence | Work::Restart | Work::Bootloader, _)));
+        if in_session && self.slept == Slept::No && !busy {
+            self.slept = Slept::Leaving;
+            if let Some((_, Origin::Request(id))) = self.work {
+                self.answers.add(id, &Err(Refusal::NoSession));
+            }
+            if let Language::Native { greeted } = &mut self.language {
+                *greeted = false;
+            }
+            self.begin(Work::Retreat, Origin::Device, board);
+        }
+        self.look_after_work(board);
+    }
+
     /// The host is gone: the channels leave the bus, and nothing of it remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
         port.hold(false);
         while port.read(&mut self.packet).is_some() {}
         if self.is_active() {
             self.language = Language::Unknown;
+            self.slept = Slept::No;
             self.inbox.clear();
             self.outbox.clear();
             self.answers.clear();
@@ -144,15 +199,20 @@ impl<'q, const N: usize> Session<'q, N> {
         let Some(result) = self.commands.progress(work, board) else { return };
         self.work = None;
         if matches!(work, Work::Silence) {
+            self.slept = Slept::No;
             self.queue.clear();
             let now = board.with_capture(|capture, _, clock| capture.restart(clock));
             self.sender.restart(now);
             self.slcan.restart(now);
+            self.marks = SofMarks::new();
+        }
+        if matches!(work, Work::Retreat) {
+            self.slept = Slept::Since(board.with_capture(|capture, _, clock| capture.now(clock)));
         }
         match origin {
             Origin::Request(id) => {
                 if matches!(work, Work::Silence) {
-                    self.language = Language::Native { greeted: true };
+                    self.language = Language::Native { greeted: result.is_ok() };
                     self.outbox.clear();
                     self.answers.clear();
                 }
@@ -295,14 +355,29 @@ impl<'q, const N: usize> Session<'q, N> {
     /// Fills the empty outbox with what goes next: the answers, and behind them what was captured. Returns whether there was
     /// something.
     fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        let Self { queue, sender, slcan, outbox, answers, .. } = self;
+        let Self { queue, sender, slcan, outbox, answers, slept, .. } = self;
         match self.language {
             Language::Unknown => {}
             Language::Native { .. } => outbox.fill(|out| {
                 let answered = answers.take(out);
-                answered + sender.next_batch(queue, board.now(), &mut out[answered..])
+                let rest = &mut out[answered..];
+                let mut len = sender.next_batch(queue, board.now(), rest, |message| board.crc32(message));
+                if let (0, Slept::Since(at)) = (len, *slept) {
+                    len = sender.end(queue, EndReason::Suspended, at, rest);
+                    if len > 0 {
+                        *slept = Slept::No;
+                    }
+                }
+                answered + len
             }),
-            Language::Slcan => outbox.fill(|out| slcan.next_lines(queue, out)),
+            Language::Slcan => {
+                outbox.fill(|out| slcan.next_lines(queue, out));
+                if outbox.is_empty() && matches!(slept, Slept::Since(_)) {
+                    *slept = Slept::No;
+                    slcan.answer(Answer::Refused);
+                    outbox.fill(|out| slcan.next_lines(queue, out));
+                }
+            }
         }
         !self.outbox.is_empty()
     }

@@ -2,7 +2,9 @@
 //!
 //! Commands follow the CANUSB manual (Lawicel AB, version 1.0D): a letter, parameters, CR; answered by CR, or BEL for
 //! a refusal. `I` and `Y`, the registers now and at the last error, are those of an earlier analyser. What was lost shows in
-//! the flags that `F` reads.
+//! the flags that `F` reads, and with `K1` in lines of its own.
+
+mod report;
 
 use core::fmt::Write;
 
@@ -80,6 +82,10 @@ pub struct Slcan {
     code: u32,
     mask: u32,
     flags: u8,
+    /// Losses, errors and states are lines (`K1`).
+    reports: bool,
+    /// A frame was refused for want of room, which is still to be reported.
+    refused_frame: bool,
     tag: u32,
     running_ticks: u64,
     /// Since when the transmit queue has been full.
@@ -103,6 +109,8 @@ impl Slcan {
             code: 0,
             mask: u32::MAX,
             flags: 0,
+            reports: false,
+            refused_frame: false,
             tag: 0,
             running_ticks: 0,
             full_since: None,
@@ -204,6 +212,10 @@ impl Slcan {
                 self.auto_poll = digit == b'1';
                 Some(ok)
             }
+            (b'K', &[digit @ b'0'..=b'1']) if !open => {
+                self.reports = digit == b'1';
+                Some(ok)
+            }
             (b'P', []) if open && !self.auto_poll => {
                 self.polled = 1;
                 self.polling_all = false;
@@ -288,6 +300,7 @@ impl Slcan {
             Ok(_) => Some(Done::Answer(Answer::Ok)),
             Err(Refusal::QueueFull { .. }) => {
                 self.flags |= flag::TX_FULL;
+                self.refused_frame = true;
                 None
             }
             Err(_) => None,
@@ -336,6 +349,9 @@ impl Slcan {
             }
             None => true,
         };
+        if core::mem::take(&mut self.refused_frame) && self.reports {
+            let _ = lines.extend_from_slice(report::transmit_overrun().as_bytes());
+        }
         while queue.read(|bytes| self.take(bytes, &mut lines)) > 0 {}
         if self.polled > 0 {
             // The queue is drained: `A` ends, and a `P` that found nothing is answered.
@@ -353,7 +369,7 @@ impl Slcan {
         let mut rest = bytes;
         while lines.capacity() - lines.len() > MAX_FRAME_LINE {
             let Ok((record, difference, after)) = record::decode(rest) else { break };
-            let at = self.running_ticks.wrapping_add_signed(i64::from(difference));
+            let at = self.running_ticks.wrapping_add_signed(difference);
             match record {
                 Record::Received(received) => {
                     if !self.auto_poll {
@@ -364,7 +380,14 @@ impl Slcan {
                     }
                     self.frame_line(&received.frame, at, lines);
                 }
-                Record::Event(event) => self.note(&event),
+                Record::Event(event) => {
+                    self.note(&event);
+                    // A host that polls expects nothing between its questions.
+                    if let Some(line) = report::line(&event).filter(|_| self.reports && self.auto_poll) {
+                        // Fits: it is shorter than a frame's line.
+                        let _ = lines.extend_from_slice(line.as_bytes());
+                    }
+                }
             }
             self.running_ticks = at;
             rest = after;

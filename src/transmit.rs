@@ -1,17 +1,19 @@
 //! Puts frames on the bus: a queue in order, frames at their time, periodic frames, replies.
 //!
 //! One per channel, in the highest-priority interrupts. Mailboxes leave in the order in which they were requested.
-//! Whenever one is free, a reply goes first, then a periodic frame that is due, then the queue's head once
+//! Whenever one is free, a reply goes first, then a periodic frame that is due ([`crate::periodic`]), then the queue's head once
 //! its time has come.
+//!
+//! Each call does a bounded piece of work: it fills the free mailboxes, three at most, and writes at most `GIVEN_UP_PER_CALL`
+//! records of frames that are given up. `docs/architecture.md` has the time that this takes.
 
-use cantap_wire::message::{DEVICE_TAG, Modifier, Periodic, TRIGGER_TAG, Trigger, TxFrame};
+use cantap_wire::message::{Periodic, TRIGGER_TAG, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Event, Frame};
 use heapless::Deque;
 
-use crate::TICKS_PER_US;
-use crate::checksum::checksum;
 use crate::mailboxes::Mailboxes;
+use crate::periodic::PeriodicTable;
 use crate::ports::{Outcome, Traffic};
 use crate::recorder::Recorder;
 
@@ -19,16 +21,11 @@ use crate::recorder::Recorder;
 pub const MAILBOXES: usize = 3;
 /// Frames that the queue holds: 28 ms of the shortest eight-byte frames at 1 Mbit/s.
 pub const TX_QUEUE: usize = 256;
-/// Periodic entries.
-pub const PERIODIC_SLOTS: usize = 32;
 /// Replies.
 pub const TRIGGER_SLOTS: usize = 8;
 
-/// Shortest period: no frame is shorter than 47 µs.
-pub const MIN_PERIOD_TICKS: u32 = 47 * TICKS_PER_US;
-/// Periodic entries are looked at no more often than this, so that many short periods cannot take
-/// the processor from the capture.
-const LOOK_EVERY_TICKS: u64 = 20 * TICKS_PER_US as u64;
+/// Frames of the queue that one call gives up: a whole queue at once would take longer than a receive FIFO can wait.
+const GIVEN_UP_PER_CALL: usize = 16;
 /// "Never", for due times.
 pub const NEVER: u64 = u64::MAX;
 
@@ -38,16 +35,6 @@ struct Queued {
     frame: Frame,
     /// 0: at once.
     at: u64,
-}
-
-struct PeriodicState {
-    entry: Periodic,
-    next_due: u64,
-    /// Left to send; `None` for ever.
-    left: Option<u32>,
-    /// Due, and waiting for a mailbox.
-    waiting: bool,
-    step: u32,
 }
 
 struct TriggerState {
@@ -61,20 +48,17 @@ pub struct Transmitter {
     channel: Channel,
     queue: Deque<Queued, TX_QUEUE>,
     mailboxes: Mailboxes,
-    periodic: [Option<PeriodicState>; PERIODIC_SLOTS],
-    /// When the periodic entries are to be looked at: at the earliest due time among them, but not before `look_from`.
-    periodic_due: u64,
-    look_from: u64,
-    periodic_waiting: u8,
+    periodic: PeriodicTable,
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
     triggers_armed: bool,
     replies_waiting: u8,
-    random: u32,
     /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
     /// is sent until it is written; what was in the mailboxes by then has room here too.
     unconfirmed: Deque<Event, { 2 * MAILBOXES }>,
     /// The queue is being given up, as fast as its records find room.
     dropping: Option<TransmitFailure>,
+    /// The controller stays off the bus: no mailbox is filled.
+    off: bool,
     sent: u32,
     failed: u32,
 }
@@ -86,30 +70,34 @@ impl Transmitter {
             channel,
             queue: Deque::new(),
             mailboxes: Mailboxes::new(),
-            periodic: [const { None }; PERIODIC_SLOTS],
-            periodic_due: NEVER,
-            look_from: 0,
-            periodic_waiting: 0,
+            periodic: PeriodicTable::new(channel),
             triggers: [const { None }; TRIGGER_SLOTS],
             triggers_armed: false,
             replies_waiting: 0,
-            random: 0x1234_5678,
             unconfirmed: Deque::new(),
             dropping: None,
+            off: false,
             sent: 0,
             failed: 0,
         }
     }
 
-    /// Frames sent, and frames not sent, since [`Self::reset_counters`].
+    /// Frames sent, and frames not sent, since [`Self::reset_counters`]. Of periods that passed without a frame those that
+    /// were counted: see [`Self::count_overtaken`].
     pub const fn counters(&self) -> (u32, u32) {
-        (self.sent, self.failed)
+        (self.sent, self.failed.wrapping_add(self.periodic.overtaken()))
+    }
+
+    /// Counts the periods that have passed without a frame.
+    pub fn count_overtaken(&mut self, now: u64) {
+        self.periodic.count_overtaken(now);
     }
 
     /// Starts the counters over.
     pub const fn reset_counters(&mut self) {
         self.sent = 0;
         self.failed = 0;
+        self.periodic.reset_counter();
     }
 
     /// Frames in the queue or a mailbox.
@@ -136,22 +124,12 @@ impl Transmitter {
 
     /// Sets or clears a periodic entry; its first transmission is due at `now`.
     pub fn set_periodic(&mut self, slot: usize, entry: Option<Periodic>, now: u64) {
-        let Some(place) = self.periodic.get_mut(slot) else { return };
-        *place = entry.map(|entry| PeriodicState {
-            left: (entry.count > 0).then_some(entry.count),
-            entry,
-            next_due: now,
-            waiting: false,
-            step: 0,
-        });
-        self.count_periodic();
+        self.periodic.set(slot, entry, now);
     }
 
-    fn count_periodic(&mut self) {
-        let entries = || self.periodic.iter().flatten();
-        self.periodic_waiting = entries().filter(|entry| entry.waiting).count() as u8;
-        let due = entries().map(|entry| entry.next_due).min();
-        self.periodic_due = due.map_or(NEVER, |due| due.max(self.look_from));
+    /// Whether the controller stays off the bus until a command brings it back. Nothing goes into its mailboxes until then.
+    pub const fn set_off(&mut self, off: bool) {
+        self.off = off;
     }
 
     /// Sets or clears a reply.
@@ -181,13 +159,16 @@ impl Transmitter {
         }
     }
 
-    /// The controller is off the bus and reports its mailboxes no more: records them with `reason`.
+    /// The controller is off the bus and reports its mailboxes no more: records them with `reason`, and gives them up for good, so
+    /// that nothing of them is sent when it is on a bus again.
     pub fn give_up_mailboxes<const N: usize>(
         &mut self,
+        traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
         reason: TransmitFailure,
     ) {
+        traffic.abort();
         while let Some((mailbox, tag)) = self.mailboxes.first() {
             if !recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
                 return;
@@ -195,23 +176,40 @@ impl Transmitter {
             self.failed = self.failed.wrapping_add(1);
             self.mailboxes.take(mailbox);
         }
+        // Their ends are told.
+        while traffic.take_finished().is_some() {}
     }
 
     /// Forgets the periodic entries and the replies.
-    pub fn clear_entries(&mut self) {
-        self.periodic = [const { None }; PERIODIC_SLOTS];
+    pub fn clear_entries(&mut self, now: u64) {
+        self.periodic.clear(now);
+        self.clear_triggers();
+    }
+
+    fn clear_triggers(&mut self) {
         self.triggers = [const { None }; TRIGGER_SLOTS];
-        self.count_periodic();
         self.count_triggers();
     }
 
     /// Forgets everything, unrecorded, for when nobody listens any more.
     pub fn clear(&mut self) {
-        self.clear_entries();
+        self.periodic.forget();
+        self.clear_triggers();
         self.queue.clear();
         self.unconfirmed.clear();
         self.mailboxes = Mailboxes::new();
         self.dropping = None;
+        self.off = false;
+    }
+
+    /// Once a millisecond: tells of periods that passed without a frame, not each but their number.
+    pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
+        self.periodic.tick(recorder, now);
+    }
+
+    /// The channel is closed: tells what [`Self::tick`] has not told yet, a few records in each call. Returns whether that was all.
+    pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
+        self.periodic.tell_rest(recorder, now)
     }
 
     /// A frame was received: arms the replies that it asks for. Returns whether there is one.
@@ -264,8 +262,8 @@ impl Transmitter {
 
     /// Whether something other than the queue's frames is waiting, for [`Self::service`].
     pub fn has_more(&self, now: u64) -> bool {
-        let waiting = self.replies_waiting > 0 || self.periodic_waiting > 0 || self.dropping.is_some();
-        waiting || self.periodic_due <= now
+        let waiting = self.replies_waiting > 0 || self.periodic.is_waiting() || self.dropping.is_some();
+        waiting || self.periodic.due() <= now
     }
 
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
@@ -284,7 +282,7 @@ impl Transmitter {
     pub fn prepare_head(&mut self, traffic: &mut impl Traffic, at: u64) -> Option<u8> {
         // Whatever is in a mailbox must find room to be kept when it has finished.
         let kept = self.unconfirmed.len() + self.mailboxes.len();
-        if kept >= self.unconfirmed.capacity() || self.has_more(at) {
+        if kept >= self.unconfirmed.capacity() || self.off || self.has_more(at) {
             return None;
         }
         traffic.prepare(&self.queue.front()?.frame)
@@ -320,29 +318,44 @@ impl Transmitter {
             return;
         }
         if let Some(reason) = self.dropping {
-            while let Some(&Queued { tag, .. }) = self.queue.front() {
+            for _ in 0..GIVEN_UP_PER_CALL {
+                let Some(&Queued { tag, .. }) = self.queue.front() else { break };
                 if !recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now) {
                     return;
                 }
                 self.failed = self.failed.wrapping_add(1);
                 self.queue.pop_front();
             }
+            if !self.queue.is_empty() {
+                return;
+            }
             self.dropping = None;
         }
-        if self.periodic_due <= now {
-            self.start_due(recorder, now);
+        if self.off {
+            return;
+        }
+        if self.periodic.due() <= now {
+            self.periodic.look(now);
         }
         while self.replies_waiting > 0 {
             if !self.send_reply(traffic) {
                 return;
             }
         }
-        while self.periodic_waiting > 0 {
-            if !self.send_periodic(traffic) {
+        while self.periodic.is_waiting() {
+            if !self.send_periodic(traffic, now) {
                 return;
             }
         }
         self.load_due(traffic, now);
+    }
+
+    /// Whether a frame that becomes due can leave. Otherwise it waits for something else than time: for a mailbox, of which the
+    /// interrupt tells, or for room in the record queue, which is tried every millisecond. An alarm for it would come again
+    /// and again, and keep the USB that makes the room from running.
+    #[inline]
+    fn can_load(&self) -> bool {
+        !self.mailboxes.are_full() && self.unconfirmed.is_empty() && self.dropping.is_none() && !self.off
     }
 
     /// When the queue's head is due, if there is one and a mailbox is free: one that is due waits for a mailbox, not for time. 0
@@ -355,23 +368,21 @@ impl Transmitter {
         }
     }
 
-    /// When the periodic entries are to be looked at; [`NEVER`] if there are none.
+    /// When the next periodic entry is due, if its frame can leave then.
     #[inline]
-    pub const fn periodic_due(&self) -> u64 {
-        self.periodic_due
+    pub fn periodic_due(&self) -> u64 {
+        if self.can_load() { self.periodic.due() } else { NEVER }
     }
 
     /// The next time at which [`Self::service`] has something to do that no interrupt of the controller tells.
     #[inline]
     pub fn next_due(&self) -> u64 {
-        // What waits for room in the record queue is tried again every millisecond; an alarm would come again and again and
-        // keep USB, which makes the room, from running.
-        if !self.unconfirmed.is_empty() || self.dropping.is_some() {
+        if !self.can_load() {
             return NEVER;
         }
         let head = self.head_due();
         // Without a time it waits for something else.
-        self.periodic_due.min(if head == 0 { NEVER } else { head })
+        self.periodic.due().min(if head == 0 { NEVER } else { head })
     }
 
     fn load(&mut self, tag: u32, frame: &Frame, traffic: &mut impl Traffic) -> bool {
@@ -379,31 +390,6 @@ impl Transmitter {
         traffic.request(mailbox);
         self.mailboxes.put(mailbox, tag, *frame);
         true
-    }
-
-    fn start_due<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
-        self.look_from = now + LOOK_EVERY_TICKS;
-        for (slot, place) in self.periodic.iter_mut().enumerate() {
-            let Some(periodic) = place else { continue };
-            while periodic.next_due <= now {
-                if periodic.waiting {
-                    self.failed = self.failed.wrapping_add(1);
-                    let tag = DEVICE_TAG + slot as u32;
-                    let reason = TransmitFailure::Overtaken;
-                    // Without room the status counter still tells of it.
-                    recorder.event(&Event::TransmitFailed { channel: self.channel, tag, reason }, now);
-                }
-                periodic.waiting = true;
-                let period = u64::from(periodic.entry.period_ticks.max(1));
-                periodic.next_due += period;
-                // Far behind (the bus was blocked): due times stay multiples of the period. No record for each, but all are counted.
-                if let Some(behind) = now.checked_sub(periodic.next_due + period * 4) {
-                    self.failed = self.failed.wrapping_add((behind / period) as u32);
-                    periodic.next_due += behind / period * period;
-                }
-            }
-        }
-        self.count_periodic();
     }
 
     fn send_reply(&mut self, traffic: &mut impl Traffic) -> bool {
@@ -425,79 +411,15 @@ impl Transmitter {
         true
     }
 
-    fn send_periodic(&mut self, traffic: &mut impl Traffic) -> bool {
-        let random = self.next_random();
-        let next = self.periodic.iter().position(|place| place.as_ref().is_some_and(|entry| entry.waiting));
-        let Some((slot, frame)) =
-            next.and_then(|slot| Some((slot, modified(self.periodic[slot].as_ref()?, random))))
-        else {
-            self.periodic_waiting = 0;
-            return false;
-        };
-        if !self.load(DEVICE_TAG + slot as u32, &frame, traffic) {
+    fn send_periodic(&mut self, traffic: &mut impl Traffic, now: u64) -> bool {
+        if self.mailboxes.are_full() {
             return false;
         }
-        let place = &mut self.periodic[slot];
-        if let Some(periodic) = place {
-            periodic.waiting = false;
-            periodic.step = periodic.step.wrapping_add(1);
-            periodic.left = periodic.left.map(|left| left.saturating_sub(1));
-            if periodic.left == Some(0) {
-                *place = None;
-            }
+        let Some((tag, frame)) = self.periodic.next_frame() else { return false };
+        let loaded = self.load(tag, &frame, traffic);
+        if loaded {
+            self.periodic.loaded(now);
         }
-        self.count_periodic();
-        true
+        loaded
     }
-
-    /// xorshift32 (Marsaglia, "Xorshift RNGs", 2003).
-    fn next_random(&mut self) -> u32 {
-        self.random ^= self.random << 13;
-        self.random ^= self.random >> 17;
-        self.random ^= self.random << 5;
-        self.random
-    }
-}
-
-/// A periodic entry's frame with its modifiers applied.
-fn modified(periodic: &PeriodicState, mut random: u32) -> Frame {
-    let frame = &periodic.entry.frame;
-    let mut data = frame.padded_data();
-    let len = frame.data_len();
-    for modifier in &periodic.entry.modifiers {
-        match *modifier {
-            Modifier::Counter { byte, low_bit, bits } => {
-                let mask = ((1u16 << bits) - 1) as u8;
-                if let Some(value) = data[..len].get_mut(byte as usize) {
-                    let counted = (*value >> low_bit).wrapping_add(periodic.step as u8) & mask;
-                    *value = *value & !(mask << low_bit) | counted << low_bit;
-                }
-            }
-            Modifier::Checksum { byte, algorithm } => {
-                let sum = checksum(algorithm, &data[..len], byte as usize);
-                if let Some(value) = data[..len].get_mut(byte as usize) {
-                    *value = sum;
-                }
-            }
-            Modifier::Random { byte } => {
-                if let Some(value) = data[..len].get_mut(byte as usize) {
-                    *value = random as u8;
-                }
-                random = random.rotate_right(8);
-            }
-        }
-    }
-    Frame::from_bus(frame.id(), frame.is_remote(), frame.dlc(), data)
-}
-
-/// Whether an entry can be applied: a period, and modifiers inside the frame's data.
-pub fn is_valid(entry: &Periodic) -> bool {
-    let len = entry.frame.data_len();
-    entry.period_ticks >= MIN_PERIOD_TICKS
-        && entry.modifiers.iter().all(|modifier| match *modifier {
-            Modifier::Counter { byte, low_bit, bits } => {
-                (byte as usize) < len && low_bit < 8 && (1..=8 - low_bit).contains(&bits)
-            }
-            Modifier::Checksum { byte, .. } | Modifier::Random { byte } => (byte as usize) < len,
-        })
 }

@@ -56,7 +56,7 @@ fn check(pace: impl Fn(u32)) -> u32 {
             let used = consumer.read(|bytes| {
                 let (record, ticks, rest) =
                     record::decode(bytes).expect("only whole records are in the queue");
-                time += i64::from(ticks);
+                time += ticks;
                 match record {
                     Record::Received(received) => {
                         let number = &mut next[received.channel.index()];

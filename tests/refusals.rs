@@ -3,8 +3,9 @@
 
 mod fakes;
 
+use cantap_firmware::periodic::PERIODIC_SLOTS;
 use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::transmit::{PERIODIC_SLOTS, TRIGGER_SLOTS, TX_QUEUE};
+use cantap_firmware::transmit::{TRIGGER_SLOTS, TX_QUEUE};
 use cantap_wire::message::{
     ChannelConfig, Defaults, Filter, FrameKind, MAX_FILTERS, Mode, Modifier, Periodic, Trigger, TxFrame,
 };

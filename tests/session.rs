@@ -4,8 +4,8 @@ mod fakes;
 
 use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
-use cantap_wire::message::{Filter, FrameKind, Mode, TxFrame};
-use cantap_wire::{Channel, Command, Event, PROTOCOL_VERSION, Refusal, Reply, Request};
+use cantap_wire::message::{EndReason, Filter, FrameKind, Mode, TxFrame};
+use cantap_wire::{Channel, Command, Event, PROTOCOL_VERSION, Refusal, Reply, Request, Response};
 use fakes::{Bench, SMALL_QUEUE, config, encode, numbered};
 
 const CAN1: Channel = Channel::Can1;
@@ -97,6 +97,48 @@ fn a_stuck_bus_does_not_keep_a_channel_from_closing() {
     bench.board.control[0].stuck = true;
     assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Ok(Reply::Done));
     assert_eq!(bench.board.control[0].halts, 1);
+}
+
+/// Behind a reset of the controller the filters may be gone, the other channel's too.
+#[test]
+fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.greet();
+    let filters = [Filter { extended: false, kind: FrameKind::Any, id: 1, mask: 1 }].into_iter().collect();
+    bench.ask(Command::SetFilters { channel: CAN1, filters }).unwrap();
+    for channel in Channel::ALL {
+        bench.ask(Command::Open { channel, config: Some(config(Mode::Normal)) }).unwrap();
+    }
+    let written = bench.board.filters.written.clone();
+    bench.ask(Command::Close { channel: CAN2 }).unwrap();
+    assert_eq!(bench.board.filters.written, written, "it left by itself");
+    bench.board.control[0].stuck = true;
+    bench.board.control[0].halts_needed = 3;
+    bench.ask(Command::Close { channel: CAN1 }).unwrap();
+    assert_eq!(bench.board.control[0].halts, 3);
+    assert_eq!(bench.board.filters.written.len(), written.len() + 1);
+    assert_eq!(bench.board.filters.written.last(), written.last());
+    assert!(bench.board.traffic[0].aborts > 0);
+}
+
+/// A controller without a clock: the host gets an answer, and can try again.
+#[test]
+fn a_controller_that_does_not_follow_is_refused_in_time() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    bench.board.control[0].stuck = true;
+    bench.board.control[0].halts_needed = usize::MAX;
+    let from = bench.board.clock.now.get();
+    assert_eq!(bench.ask(Command::Close { channel: CAN1 }), Err(Refusal::Hardware));
+    let waited_ms = (bench.board.clock.now.get() - from) / (TICK_HZ / 1000);
+    assert!((200..=205).contains(&waited_ms), "after {waited_ms} ms");
+    bench.say(&[0]);
+    assert_eq!(bench.ask(Command::Hello { protocol: PROTOCOL_VERSION }), Err(Refusal::Hardware));
+    assert_eq!(bench.ask(Command::Status), Err(Refusal::NoSession));
+    bench.board.control[0].halts_needed = 0;
+    bench.greet();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::Normal)) }).unwrap();
 }
 
 #[test]
@@ -306,4 +348,83 @@ fn a_channel_closes_though_a_mailbox_stays_silent() {
         bench.events(),
         [Event::TransmitFailed { channel: CAN1, tag: 1, reason }, Event::Stopped { channel: CAN1 }]
     );
+}
+
+/// What is queued when the host falls asleep is delivered when it wakes, and behind it the session's end: nothing is missing
+/// that is not counted.
+#[test]
+fn a_host_that_wakes_gets_what_was_queued_and_is_told_that_the_session_has_ended() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    let frames = [TxFrame { tag: 1, frame: numbered(9), at_ticks: None }].into_iter().collect();
+    bench.port.takes = 0;
+    bench.receive(CAN1, numbered(1));
+    bench.receive(CAN2, numbered(2));
+    bench.say(&encode(&Request { id: 900, command: Command::Send { channel: CAN2, frames } }));
+    bench.millisecond();
+    bench.receive(CAN1, numbered(3));
+    bench.sleep(true);
+    bench.millisecond();
+    assert!(bench.board.control.iter().all(|control| !control.running));
+    let left_at = u64::from(bench.board.clock.now.get());
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert!(bench.records.is_empty());
+    bench.port.takes = usize::MAX;
+    bench.sleep(false);
+    bench.say(&encode(&Request { id: 901, command: Command::Time }));
+    for _ in 0..3 {
+        bench.millisecond();
+    }
+    assert_eq!(bench.frames(CAN1), [numbered(1), numbered(3)]);
+    assert_eq!(bench.frames(CAN2), [numbered(2)]);
+    let reason = cantap_wire::record::TransmitFailure::Closed;
+    assert_eq!(
+        bench.events(),
+        [
+            Event::TransmitFailed { channel: CAN2, tag: 1, reason },
+            Event::Stopped { channel: CAN1 },
+            Event::Stopped { channel: CAN2 }
+        ]
+    );
+    let [(ended_at, EndReason::Suspended)] = bench.ends[..] else { panic!("{:?}", bench.ends) };
+    assert!(ended_at.abs_diff(left_at) <= u64::from(TICK_HZ / 1000), "{ended_at} is not {left_at}");
+    assert_eq!(bench.responses.last(), Some(&Response { id: 901, result: Err(Refusal::NoSession) }));
+    assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
+
+    // Told once, and the next session is as any other.
+    bench.sleep(true);
+    bench.millisecond();
+    bench.sleep(false);
+    bench.millisecond();
+    assert_eq!(bench.ends.len(), 1);
+    bench.records.clear();
+    bench.greet();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
+    bench.receive(CAN1, numbered(4));
+    bench.millisecond();
+    bench.millisecond();
+    assert_eq!(bench.frames(CAN1), [numbered(4)]);
+}
+
+/// The cable was pulled, or the host lost power while it slept: there is nobody to be told.
+#[test]
+fn what_was_kept_for_a_sleeping_host_goes_with_it() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.port.takes = 0;
+    let before = bench.port.packets.len();
+    bench.receive(CAN1, numbered(1));
+    bench.sleep(true);
+    bench.millisecond();
+    bench.port.suspended = false;
+    bench.millisecond();
+    bench.port.open = true;
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    assert!(bench.records.is_empty() && bench.ends.is_empty() && bench.port.packets.len() == before);
+    bench.greet();
+    let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+    assert_eq!((status.queue_bytes, status.channels[0].open), (0, None));
 }

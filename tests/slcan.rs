@@ -233,6 +233,85 @@ fn losses_and_errors_set_flags_that_reading_clears() {
     converse(&mut bench, &[("F", "F24\r"), ("F", "F00\r")]);
 }
 
+/// With K1, what `F` would tell is told in lines that Linux' slcan driver takes, none of them shorter than five characters.
+#[test]
+fn losses_errors_and_states_are_lines_where_they_are_asked_for() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(
+        &mut bench,
+        &[("K2", "\x07"), ("K", "\x07"), ("K1", "\r"), ("S8", "\r"), ("O", "\r"), ("K0", "\x07")],
+    );
+    // Four frames for a FIFO of three.
+    for _ in 0..4 {
+        bench.board.traffic[0].arrive("123#".parse().unwrap());
+    }
+    let before = bench.port.from_device.len();
+    bench.interrupt(CAN1);
+    bench.poll();
+    assert_eq!(bench.port.from_device[before..], *b"t1230\rt1230\rt1230\re3ooo\r");
+    let kinds = [
+        (BusErrorKind::Stuff, 's'),
+        (BusErrorKind::Form, 'f'),
+        (BusErrorKind::Acknowledgment, 'a'),
+        (BusErrorKind::BitRecessive, 'B'),
+        (BusErrorKind::BitDominant, 'b'),
+        (BusErrorKind::Crc, 'c'),
+    ];
+    for (kind, letter) in kinds {
+        let before = bench.port.from_device.len();
+        bench.board.traffic[0].error = Some(kind);
+        bench.millisecond();
+        let line = format!("e3{letter}{letter}{letter}\r");
+        assert_eq!(bench.port.from_device[before..], *line.as_bytes(), "{kind:?}");
+    }
+    let states = [
+        (ErrorState::Warning, (96, 0), "sw000096\r"),
+        (ErrorState::Passive, (12, 128), "sp128012\r"),
+        (ErrorState::BusOff, (255, 128), "sb128255\r"),
+        (ErrorState::Active, (0, 7), "sa007000\r"),
+    ];
+    for (state, counters, line) in states {
+        let before = bench.port.from_device.len();
+        bench.board.traffic[0].counters = counters;
+        bench.board.traffic[0].state = Some(state);
+        bench.millisecond();
+        assert_eq!(bench.port.from_device[before..], *line.as_bytes(), "{state:?}");
+    }
+    // The flags are there as without.
+    converse(&mut bench, &[("F", "FAC\r"), ("C", "\r"), ("K0", "\r"), ("O", "\r")]);
+    let before = bench.port.from_device.len();
+    bench.board.traffic[0].error = Some(BusErrorKind::Stuff);
+    bench.millisecond();
+    assert_eq!(bench.port.from_device[before..], *b"");
+}
+
+#[test]
+fn a_frame_refused_for_want_of_room_is_a_line_where_it_is_asked_for() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("K1", "\r"), ("S8", "\r"), ("O", "\r")]);
+    let taken = (0..400).take_while(|_| say(&mut bench, "t1230") == "z\r").count();
+    assert_eq!(taken, TX_QUEUE + MAILBOXES);
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert!(bench.port.from_device.ends_with(b"\x07e3OOO\r"));
+}
+
+/// A host that polls gets answers, and nothing between them.
+#[test]
+fn a_host_that_polls_is_not_interrupted_by_reports() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("K1", "\r"), ("X0", "\r"), ("S8", "\r"), ("O", "\r")]);
+    let before = bench.port.from_device.len();
+    bench.board.traffic[0].error = Some(BusErrorKind::Stuff);
+    bench.millisecond();
+    assert_eq!(bench.port.from_device[before..], *b"");
+    converse(&mut bench, &[("F", "F80\r")]);
+}
+
 /// M and m are an SJA1000's acceptance code and mask; a mask bit of 1 does not count. With W1, one long filter.
 #[test]
 fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
@@ -315,4 +394,26 @@ fn half_a_line_does_not_keep_the_native_language_from_taking_over() {
     let mut bench = Bench::new(&queue);
     bench.say(&[b't'; 200]);
     bench.greet();
+}
+
+/// slcan has no word for the end of a session: a BEL behind what was captured, and the channel is closed. Its settings stay.
+#[test]
+fn a_host_that_wakes_gets_what_was_captured_and_a_bel() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S6", "\r"), ("O", "\r")]);
+    bench.board.traffic[0].arrive("123#11".parse().unwrap());
+    bench.interrupt(CAN1);
+    bench.sleep(true);
+    for _ in 0..3 {
+        bench.millisecond();
+    }
+    assert!(!bench.board.control[0].running);
+    let before = bench.port.from_device.len();
+    bench.sleep(false);
+    for _ in 0..3 {
+        bench.millisecond();
+    }
+    assert_eq!(bench.port.from_device[before..], *b"t123111\r\x07");
+    converse(&mut bench, &[("t1230", "\x07"), ("O", "\r")]);
 }

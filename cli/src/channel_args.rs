@@ -3,12 +3,13 @@
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cantap::filter::Filter;
+use cantap::Channel;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode};
-use cantap::{Address, Channel, Device};
+use cantap_trace::filter::Filter;
 
+use crate::address::OpenDevice;
 use crate::args;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
@@ -110,12 +111,12 @@ impl ChannelArgs {
     }
 
     /// Brings channels back from bus-off while the command runs, if the user says so.
-    pub fn rescue<'d>(&self, device: &'d Device) -> Rescue<'d> {
+    pub fn rescue(&self) -> Rescue {
         let recovery = match self.recovery {
             Some(RecoveryArg::After(time)) => Some(Recovery::new(time)),
             _ => None,
         };
-        Rescue::new(device, recovery)
+        Rescue::new(recovery)
     }
 
     /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before
@@ -123,7 +124,7 @@ impl ChannelArgs {
     /// Says on standard error which filters the hardware could not take, and that saved ones count.
     pub fn open(
         &self,
-        device: &Device,
+        device: &OpenDevice,
         channels: impl Iterator<Item = Channel>,
         mode: Mode,
         filters: Option<&[Filter]>,
@@ -156,7 +157,7 @@ impl ChannelArgs {
     /// How channels would be opened, with `mode` unless the user says otherwise. Nothing is opened.
     pub fn configs(
         &self,
-        device: &Device,
+        device: &OpenDevice,
         channels: impl IntoIterator<Item = Channel>,
         mode: Mode,
     ) -> anyhow::Result<Vec<(Channel, ChannelConfig)>> {
@@ -168,7 +169,7 @@ impl ChannelArgs {
     /// [`Device::save_defaults`] stores. What is not asked for stays as it was saved before.
     pub fn configure(
         &self,
-        device: &Device,
+        device: &OpenDevice,
         channels: impl Iterator<Item = Channel>,
         filters: &[Filter],
     ) -> anyhow::Result<()> {
@@ -190,7 +191,7 @@ impl ChannelArgs {
 
     fn plan(
         &self,
-        device: &Device,
+        device: &OpenDevice,
         channels: impl Iterator<Item = Channel>,
         mode: Option<Mode>,
     ) -> anyhow::Result<Vec<Plan>> {
@@ -199,15 +200,16 @@ impl ChannelArgs {
 
     /// The configuration that was asked for; where no bit timing was, the one saved on the device. The mode is the user's, else
     /// `mode`, else the saved one.
-    fn plan_one(&self, device: &Device, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
-        let is_virtual = matches!(device.name().parse(), Ok(Address::Virtual(_)));
+    fn plan_one(&self, device: &OpenDevice, channel: Channel, mode: Option<Mode>) -> anyhow::Result<Plan> {
         let (base, saved) = match self.timing.request(channel)? {
             Some(request) => {
                 (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
             }
             None => match device.defaults(channel)? {
                 Some(saved) => (saved.config, Some(saved)),
-                None if is_virtual => (ChannelConfig::listen_only(device.timing(VIRTUAL_BITRATE_BPS)?), None),
+                None if device.takes_any_bit_rate() => {
+                    (ChannelConfig::listen_only(device.timing(VIRTUAL_BITRATE_BPS)?), None)
+                }
                 None => bail!(
                     "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
                      with `cantap defaults save`",

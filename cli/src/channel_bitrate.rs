@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use cantap::stats::Options;
+use cantap_analysis::stats::Options;
 
 use crate::args;
 

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
-use cantap::signals::{self, Decoder, Selection, Source};
+use cantap_signals::{Decoder, Selection, Source};
 
 /// Which databases; for commands to flatten into theirs.
 #[derive(clap::Args)]
@@ -53,7 +53,7 @@ impl DatabaseArgs {
     pub fn load(&self, strict: bool) -> anyhow::Result<Decoder> {
         let mut sources = Vec::new();
         for DatabasePath { channel, path } in &self.databases {
-            let database = signals::load(path)?;
+            let database = cantap_signals::load(path)?;
             for warning in &database.warnings {
                 eprintln!("cantap: {}: {warning}", database.file);
             }
@@ -81,7 +81,7 @@ impl DatabaseArgs {
         }
         let mut sources = Vec::new();
         for DatabasePath { channel, path } in paths {
-            match signals::load(&path) {
+            match cantap_signals::load(&path) {
                 Ok(database) => {
                     let faults = database.warnings.iter();
                     complaints.extend(faults.map(|fault| format!("{}: {fault}", database.file)));

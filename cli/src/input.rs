@@ -4,8 +4,8 @@ use std::path::Path;
 
 use anyhow::bail;
 use cantap::TraceRecord;
-use cantap::filter::Filter;
-use cantap::formats::{Format, LeftOut, ReadOptions, TraceReader, open_reader};
+use cantap_formats::{Format, LeftOut, ReadOptions, TraceReader, open_reader};
+use cantap_trace::filter::Filter;
 
 use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
@@ -40,6 +40,7 @@ pub struct Records {
     at: usize,
 }
 
+#[expect(clippy::large_enum_variant, reason = "a command has one")]
 enum Source {
     /// A file, and whether it may grow.
     File(TraceReader, bool),

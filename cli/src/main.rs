@@ -1,5 +1,7 @@
 //! The `cantap` command. Each subcommand is a file in `commands/`; this one only chooses.
 
+#![forbid(unsafe_code)]
+
 /// Standard error may be closed or full, and std's macro panics then. Whoever does not read what went wrong still gets the exit code.
 macro_rules! eprintln {
     ($($part:tt)*) => {{
@@ -16,9 +18,12 @@ macro_rules! eprint {
     }};
 }
 
+mod address;
+mod advice;
 mod args;
 mod channel_args;
 mod channel_bitrate;
+mod clock;
 mod commands;
 mod databases;
 mod input;
@@ -34,9 +39,10 @@ mod trigger_args;
 mod words;
 mod wrong;
 
+use std::error::Error;
 use std::process::ExitCode;
 
-use clap::Parser;
+use clap::{CommandFactory, Parser};
 
 /// Exit codes beside 0 (success). Documented in `cantap --help`.
 mod exit {
@@ -61,12 +67,13 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
-    match Cli::parse().command.run() {
+    let cli = Cli::try_parse().unwrap_or_else(|error| leave(&error));
+    match cli.command.run(Cli::command()) {
         Ok(code) => code,
         // `cantap … | head` has read what it wanted.
         Err(error) if is_broken_pipe(&error) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("cantap: {}", sentence(&error));
+            eprintln!("cantap: {}", advice::sentence(&error));
             ExitCode::from(if is_wrong_command_line(&error) {
                 exit::WRONG_COMMAND_LINE
             } else {
@@ -76,20 +83,20 @@ fn main() -> ExitCode {
     }
 }
 
-/// The error and its causes, but for causes that the error itself tells already, as the library's do.
-fn sentence(error: &anyhow::Error) -> String {
-    error.chain().skip(1).fold(error.to_string(), |text, cause| {
-        let cause = cause.to_string();
-        if text.contains(&cause) { text } else { format!("{text}: {cause}") }
-    })
+/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is told as
+/// what is wrong with a condition, in one line.
+fn leave(error: &clap::Error) -> ! {
+    let address = error.source().and_then(|source| source.downcast_ref());
+    if let Some(address @ address::AddressError::Option { .. }) = address {
+        eprintln!("cantap: {address}");
+        std::process::exit(exit::WRONG_COMMAND_LINE.into());
+    }
+    error.exit()
 }
 
-/// What belongs to the command line and is understood only later: a condition when the databases have been read, a device's
-/// options when it is opened.
+/// What belongs to the command line and is understood only later, as a condition is when the databases have been read.
 fn is_wrong_command_line(error: &anyhow::Error) -> bool {
-    error.is::<wrong::WrongCommandLine>()
-        || error.is::<cantap::condition::ConditionError>()
-        || matches!(error.downcast_ref(), Some(cantap::DeviceError::BadAddress { .. }))
+    error.is::<wrong::WrongCommandLine>() || error.is::<cantap_signals::condition::ConditionError>()
 }
 
 /// Whether it only says that nobody reads our output any more.

@@ -1,15 +1,19 @@
 //! What a capture's summary says of a channel.
 
-use cantap::stats::WorkLoad;
 use cantap::wire::message::ChannelConfig;
 use cantap::{TraceEvent, TraceRecord, bits_on_bus};
+use cantap_analysis::stats::WorkLoad;
 
 /// Counts one channel's frames as they are delivered.
 pub struct Meter {
     frames: u64,
     lost: u64,
     bus_errors: u64,
-    span_ns: Option<(i64, i64)>,
+    /// Time of the last frame, where nothing is between it and the next.
+    latest_ns: Option<i64>,
+    /// Times from one frame to the next, all together, and how many.
+    covered_ns: i64,
+    intervals: u64,
     load: WorkLoad,
     omits_data: bool,
     omits_stamps: bool,
@@ -23,7 +27,9 @@ impl Meter {
             frames: 0,
             lost: 0,
             bus_errors: 0,
-            span_ns: None,
+            latest_ns: None,
+            covered_ns: 0,
+            intervals: 0,
             load: WorkLoad::new(bitrate_bps),
             omits_data: false,
             omits_stamps: false,
@@ -45,10 +51,16 @@ impl Meter {
         match &record.event {
             TraceEvent::Frame { frame, .. } => {
                 self.frames += 1;
-                let first = self.span_ns.map_or(record.time_ns, |(first, _)| first);
-                self.span_ns = Some((first, record.time_ns));
+                if let Some(latest_ns) = self.latest_ns.replace(record.time_ns) {
+                    self.covered_ns += record.time_ns - latest_ns;
+                    self.intervals += 1;
+                }
                 self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
                 self.load.frame(record.time_ns, bits_on_bus(frame));
+            }
+            event if *event == TraceEvent::GAP => {
+                self.latest_ns = None;
+                self.load.gap();
             }
             TraceEvent::Lost { count, .. } => {
                 self.lost += u64::from(*count);
@@ -75,15 +87,15 @@ impl Meter {
         self.bus_errors
     }
 
-    /// From the first frame to the last, in seconds.
+    /// From the first frame to the last, in seconds, without the time in which the device was not there.
     pub fn seconds(&self) -> f64 {
-        self.span_ns.map_or(0.0, |(first, last)| (last - first) as f64 / 1e9)
+        self.covered_ns as f64 / 1e9
     }
 
-    /// Delivered frames per second, between the first and the last; `None` where frames came without their times.
+    /// Delivered frames per second, in [`Self::seconds`]; `None` where frames came without their times.
     pub fn frames_per_s(&self) -> Option<f64> {
         let seconds = self.seconds();
-        let rate = if seconds > 0.0 { (self.frames - 1) as f64 / seconds } else { 0.0 };
+        let rate = if seconds > 0.0 { self.intervals as f64 / seconds } else { 0.0 };
         (!self.omits_stamps).then_some(rate)
     }
 

@@ -13,21 +13,20 @@ use crate::interrupt;
 const WAIT_EVERY: Duration = Duration::from_millis(5);
 
 /// Looks after the channels that a command has open.
-pub struct Rescue<'d> {
-    device: &'d Device,
+pub struct Rescue {
     recovery: Option<Recovery>,
 }
 
-impl<'d> Rescue<'d> {
-    /// Brings channels of this device back, or none.
-    pub const fn new(device: &'d Device, recovery: Option<Recovery>) -> Self {
-        Self { device, recovery }
+impl Rescue {
+    /// Brings channels back, or none.
+    pub const fn new(recovery: Option<Recovery>) -> Self {
+        Self { recovery }
     }
 
     /// To be called again and again. Says on standard error what it did.
-    pub fn look(&mut self) -> Result<(), DeviceError> {
+    pub fn look(&mut self, device: &Device) -> Result<(), DeviceError> {
         let Some(recovery) = &mut self.recovery else { return Ok(()) };
-        for channel in recovery.look(self.device)? {
+        for channel in recovery.look(device)? {
             eprintln!("cantap: channel {} was bus-off and joins the bus again", channel.number());
         }
         Ok(())
@@ -35,9 +34,9 @@ impl<'d> Rescue<'d> {
 
     /// As [`Self::look`], and waits until no channel is bus-off, or Ctrl-C: what is sent meanwhile would only fail. Returns
     /// whether it had to wait. An error is told by the next request.
-    pub fn wait(&mut self) -> bool {
+    pub fn wait(&mut self, device: &Device) -> bool {
         let mut waited = false;
-        while self.look().is_ok() && self.is_waiting() && !interrupt::requested() {
+        while self.look(device).is_ok() && self.is_waiting() && !interrupt::requested() {
             waited = true;
             std::thread::sleep(WAIT_EVERY);
         }

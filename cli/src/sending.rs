@@ -21,7 +21,7 @@ pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Frames being sent: counts their ends, prints them as candump would, and notices when none leaves any more.
 pub struct Sending<'d> {
     device: &'d Device,
-    rescue: Rescue<'d>,
+    rescue: Rescue,
     watch: Watch<'d>,
     quiet: bool,
     sent: u64,
@@ -35,7 +35,7 @@ pub struct Sending<'d> {
 
 impl<'d> Sending<'d> {
     /// Nothing sent yet. Prints nothing if `quiet`.
-    pub fn new(device: &'d Device, rescue: Rescue<'d>, quiet: bool) -> Self {
+    pub fn new(device: &'d Device, rescue: Rescue, quiet: bool) -> Self {
         Self {
             device,
             watch: Watch::new(device, rescue.is_on_duty()),
@@ -83,7 +83,7 @@ impl<'d> Sending<'d> {
                     }
                 }
                 // The frame still waits, and will end once.
-                Err(TransmitFailure::Overtaken) => self.overtaken += 1,
+                Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
                 Err(_) => self.failed += 1,
             }
         }
@@ -94,7 +94,7 @@ impl<'d> Sending<'d> {
     /// still. Waits while a channel is to come back from bus-off: what is sent meanwhile would only fail.
     pub fn goes_on(&mut self, ends: &[Transmission], due: [Option<u64>; CHANNELS]) -> bool {
         let goes_on = self.add(ends).and_then(|()| {
-            if self.rescue.wait() {
+            if self.rescue.wait(self.device) {
                 self.watch.excuse();
             }
             self.stands_still |= self.watch.stands_still(|channel, _| due[channel.index()])?;
@@ -106,7 +106,7 @@ impl<'d> Sending<'d> {
     /// As [`Self::goes_on`], for what the device sends by itself, and without waiting.
     pub fn device_goes_on(&mut self, ends: &[Transmission]) -> bool {
         let goes_on = self.add(ends).and_then(|()| {
-            self.rescue.look()?;
+            self.rescue.look(self.device)?;
             if self.rescue.is_waiting() {
                 self.watch.excuse();
             }
@@ -123,12 +123,13 @@ impl<'d> Sending<'d> {
         })
     }
 
-    /// Periods of a channel that passed without a frame, and frames that still wait, by the device's own count: of many
-    /// periods in a row not each is told.
-    pub fn periods_missed(&self, channel: Channel) -> anyhow::Result<u64> {
+    /// Periods of a channel that passed without a frame, and frames that still wait, by the device's own count: the stream tells
+    /// of them only ten times a second.
+    pub fn periods_missed(&mut self, channel: Channel) -> anyhow::Result<u64> {
         let status = self.device.status()?.channels[channel.index()];
         let waiting = if self.stands_still { u64::from(status.tx_pending) } else { 0 };
-        Ok(u64::from(status.transmit_failures).saturating_sub(self.failed) + waiting)
+        self.overtaken = u64::from(status.transmit_failures).saturating_sub(self.failed);
+        Ok(self.overtaken + waiting)
     }
 
     /// What became of as many frames as were asked for; fewer if the user ended it. To be called before the channels are

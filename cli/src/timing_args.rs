@@ -4,6 +4,7 @@ use cantap::Channel;
 use cantap::bit_timing::{self, TimingError, TimingRequest};
 use cantap::wire::BitTiming;
 
+use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::wrong::wrong;
 
@@ -101,7 +102,7 @@ fn register(text: &str) -> Result<BitTiming, String> {
     let plain = digits.bytes().all(|digit| digit.is_ascii_hexdigit());
     let value = u32::from_str_radix(digits, 16).ok().filter(|_| plain);
     let value = value.ok_or("write the register in hexadecimal, such as 0x001C0008")?;
-    bit_timing::from_register(value).map_err(|error| error.to_string())
+    bit_timing::from_register(value).map_err(|error| advice::told(&error))
 }
 
 fn percent(text: &str) -> Result<f64, String> {

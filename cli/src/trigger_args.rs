@@ -3,8 +3,8 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use cantap::condition::Condition;
-use cantap::trigger::{Trigger, Window};
+use cantap_signals::condition::Condition;
+use cantap_signals::trigger::{Trigger, Window};
 
 use crate::args;
 use crate::databases::DatabaseArgs;

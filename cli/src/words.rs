@@ -1,5 +1,7 @@
 //! What devices report, in the words of the field.
 
+use std::borrow::Cow;
+
 use cantap::wire::record::{BusErrorKind, ErrorState, TransmitFailure};
 
 /// A kind of error in the words of the field.
@@ -25,13 +27,17 @@ pub fn state_name(state: ErrorState) -> &'static str {
 }
 
 /// Why a frame was not sent.
-pub fn failure_name(reason: TransmitFailure) -> &'static str {
-    match reason {
+pub fn failure_name(reason: TransmitFailure) -> Cow<'static, str> {
+    let name = match reason {
         TransmitFailure::ArbitrationLost => "arbitration lost",
         TransmitFailure::BusError => "bus error",
         TransmitFailure::Aborted => "aborted",
         TransmitFailure::Closed => "channel closed",
         TransmitFailure::BusOff => "bus-off",
-        TransmitFailure::Overtaken => "its next period came first",
-    }
+        TransmitFailure::Overtaken { periods: 1 } => "its next period came first",
+        TransmitFailure::Overtaken { periods } => {
+            return format!("its next {periods} periods came first").into();
+        }
+    };
+    name.into()
 }

@@ -11,7 +11,7 @@ fn cantap() -> Command {
 }
 
 fn boat() -> PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/tests/data/nmea2000.log.gz")
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/formats/tests/data/nmea2000.log.gz")
 }
 
 /// Ten frames of 58 bits, back to back at 1 Mbit/s, as the earlier analyser's test sent them.

@@ -104,7 +104,7 @@ fn status_has_the_documented_keys() {
         |value: &serde_json::Value| value.as_object().unwrap().keys().cloned().collect::<Vec<_>>().join(" ");
     assert_eq!(
         keys(&object),
-        "bad_requests channels queue_bytes queue_high_water_bytes queue_size_bytes supply_volts temperature_celsius uptime_s"
+        "bad_requests channels clock failures last_failure queue_bytes queue_high_water_bytes queue_size_bytes supply_volts temperature_celsius uptime_s"
     );
     let channel = &object["channels"][1];
     assert_eq!((&channel["channel"], &channel["state"]), (&2.into(), &"active".into()));

@@ -318,6 +318,9 @@ fn a_port_that_vanishes_leaves_a_whole_file_and_an_error() {
     let capture = command(&arguments).stderr(Stdio::piped()).spawn().unwrap();
     wait_for_bytes(&file, 10_000);
     drop(device);
+    // It waits for the device to come back, until it is told not to.
+    let pid = capture.id().to_string();
+    assert!(Command::new("kill").args(["-INT", &pid]).status().unwrap().success());
     let output = capture.wait_with_output().unwrap();
     let err = String::from_utf8(output.stderr).unwrap();
     assert_eq!(output.status.code(), Some(1));

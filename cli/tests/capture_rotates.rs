@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::time::{Duration, Instant};
 
-use cantap::formats::{Fault, ReadIssue, ReadOptions, open_reader};
+use cantap_formats::{Fault, ReadIssue, ReadOptions, open_reader};
 
 const BUS: [&str; 6] = ["capture", "-d", "virtual:load=60,frames=std8", "-b", "500k", "-o"];
 

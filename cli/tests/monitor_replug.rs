@@ -2,50 +2,17 @@
 //! terminal, at the end of a link with a name that stays.
 #![cfg(unix)]
 
+mod port;
 #[expect(dead_code, reason = "other tests use the rest of it")]
 mod terminal;
 
-use std::os::unix::fs::symlink;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use cantap::formats::{ReadOptions, open_reader};
-use cantap::virtual_device::{self, open_terminal};
 use cantap::wire::record::LossStage;
-use cantap::{Address, Channel, Device, TraceEvent, TraceRecord};
+use cantap::{Channel, Device, TraceEvent, TraceRecord};
+use cantap_formats::{ReadOptions, open_reader};
+use port::Port;
 use terminal::Terminal;
-
-/// A port that a device can be plugged into.
-struct Port {
-    _folder: tempfile::TempDir,
-    name: PathBuf,
-    device: Option<virtual_device::Terminal>,
-}
-
-impl Port {
-    fn new() -> Self {
-        let folder = tempfile::tempdir().unwrap();
-        let name = folder.path().join("ttyACM0");
-        Self { _folder: folder, name, device: None }
-    }
-
-    fn name(&self) -> &str {
-        self.name.to_str().unwrap()
-    }
-
-    /// Plugs a device in; its options are those of the virtual device.
-    fn plug(&mut self, options: &str) {
-        self.unplug();
-        let device = open_terminal(options.parse().unwrap()).unwrap();
-        symlink(device.path(), &self.name).unwrap();
-        self.device = Some(device);
-    }
-
-    fn unplug(&mut self) {
-        // Ended before its name goes, as a cable does it.
-        self.device = None;
-        let _ = std::fs::remove_file(&self.name);
-    }
-}
 
 fn records(path: &Path) -> Vec<TraceRecord> {
     open_reader(path, &ReadOptions::default()).unwrap().map(Result::unwrap).collect()
@@ -156,7 +123,7 @@ fn a_device_in_use_elsewhere_and_one_that_comes_late_are_waited_for() {
     port.unplug();
     view.wait_for("GONE, trying again");
     // Somebody else is quicker. The view may have it in the meantime, so that it takes more than one try.
-    let address: Address = port.name().parse().unwrap();
+    let address = port.name().to_owned();
     let elsewhere = loop {
         port.plug("load=20");
         if let Ok(device) = Device::open(&address) {

@@ -6,7 +6,7 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
-const BOAT: &str = "monitor host/tests/data/nmea2000.log.gz -p docs/screens/boat.toml --once";
+const BOAT: &str = "monitor host/formats/tests/data/nmea2000.log.gz -p docs/screens/boat.toml --once";
 
 fn cantap(arguments: &str) -> (Option<i32>, String, String) {
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));

@@ -2,13 +2,14 @@
 //! a condition.
 #![cfg(unix)]
 
+mod firmware;
 #[expect(dead_code, reason = "other tests use the rest of it")]
 mod terminal;
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use cantap::formats::{ReadOptions, open_reader};
+use cantap_formats::{ReadOptions, open_reader};
 use terminal::Terminal;
 
 fn write(folder: &Path, name: &str, text: &str) -> String {
@@ -115,22 +116,9 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     assert_eq!(records[20].frame().unwrap().data(), [100]);
 }
 
-/// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it.
-fn elf() -> Option<PathBuf> {
-    if let Some(path) = std::env::var_os("CANTAP_FIRMWARE_ELF") {
-        return Some(PathBuf::from(path));
-    }
-    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/firmware/cantap-olimex-p405.elf");
-    if cfg!(feature = "emu") && built.exists() {
-        return Some(built);
-    }
-    eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware` first", built.display());
-    None
-}
-
 #[test]
 fn the_emulated_board_is_watched_sent_with_and_recorded() {
-    let Some(elf) = elf() else {
+    let Some(elf) = firmware::elf() else {
         return;
     };
     let folder = tempfile::tempdir().unwrap();

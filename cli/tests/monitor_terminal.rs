@@ -7,7 +7,7 @@ use std::path::Path;
 use std::process::{Command, Stdio};
 use std::time::Duration;
 
-use cantap::formats::{ReadOptions, open_reader};
+use cantap_formats::{ReadOptions, open_reader};
 use terminal::Terminal;
 
 const BUSY: &str = "monitor -d virtual:load=50 -b 500k";

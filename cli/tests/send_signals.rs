@@ -5,7 +5,7 @@ use std::process::{Command, Output};
 
 /// Sends on the virtual device's channel 1; without the time in front of each line.
 fn send(arguments: &[&str]) -> (Option<i32>, Vec<String>, String) {
-    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/tests/data/dbc");
+    let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/signals/tests/data/dbc");
     let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
     command.args(["send", "-d", "virtual:load=0", "can0"]).args(arguments).current_dir(folder);
     let Output { status, stdout, stderr } = command.output().unwrap();

@@ -2,10 +2,10 @@
 
 #![no_main]
 
-use cantap::condition::Condition;
-use cantap::search::{DataPattern, IdPattern};
-use cantap::signals::{Decoder, Source, dbc, encode};
-use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap_signals::condition::Condition;
+use cantap_signals::search::{DataPattern, IdPattern};
+use cantap_signals::{Decoder, Source, dbc, encode};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 const DATABASE: &[u8] =
     b"BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n SG_ T : 8|32@1- (0.1,3) [0|0] \"\" X\n\

@@ -1,8 +1,8 @@
-//! Any bytes as a DBC file; what is accepted is compiled and decoded. Seed it with `host/tests/data/dbc`.
+//! Any bytes as a DBC file; what is accepted is compiled and decoded. Seed it with `host/signals/tests/data/dbc`.
 
 #![no_main]
 
-use cantap::signals::{Decoder, Source, dbc};
+use cantap_signals::{Decoder, Source, dbc};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     if let Ok(database) = dbc::parse("fuzz.dbc", bytes) {

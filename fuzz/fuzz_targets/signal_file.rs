@@ -2,7 +2,7 @@
 
 #![no_main]
 
-use cantap::signals::{Decoder, Source, file};
+use cantap_signals::{Decoder, Source, file};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
     if let Ok(database) = file::parse("fuzz.toml", bytes) {

@@ -1,9 +1,9 @@
-//! What the targets of all trace readers do with their bytes. Seeds: `host/tests/data/nmea2000.log.gz` converted
+//! What the targets of all trace readers do with their bytes. Seeds: `host/formats/tests/data/nmea2000.log.gz` converted
 //! to the format.
 
 use std::io::Cursor;
 
-use cantap::formats::{Format, ReadOptions, TraceReader};
+use cantap_formats::{Format, ReadOptions, TraceReader};
 
 /// Reads a file in every way: no panic, an end, and no more found than the file can hold.
 pub fn read(format: Format, bytes: &[u8]) {

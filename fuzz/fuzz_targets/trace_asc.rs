@@ -4,6 +4,6 @@
 
 mod trace;
 
-use cantap::formats::Format;
+use cantap_formats::Format;
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| trace::read(Format::Asc, bytes));

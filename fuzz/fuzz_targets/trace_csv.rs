@@ -4,6 +4,6 @@
 
 mod trace;
 
-use cantap::formats::{CsvDialect, Format};
+use cantap_formats::{CsvDialect, Format};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| trace::read(Format::Csv(CsvDialect::PythonCan), bytes));

@@ -4,6 +4,6 @@
 
 mod trace;
 
-use cantap::formats::{Format, TrcVersion};
+use cantap_formats::{Format, TrcVersion};
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| trace::read(Format::Trc(TrcVersion::V2_1), bytes));

@@ -6,8 +6,6 @@
 //! how fast the bus is (`hearing.rs`).
 
 mod hearing;
-#[cfg(all(test, feature = "virtual"))]
-mod on_the_virtual_device;
 mod rates;
 
 use std::time::Duration;
@@ -17,15 +15,10 @@ use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{BitTiming, Channel, Command, Frame};
 
 use self::hearing::Bounds;
-use self::rates::{clocks_of, next_to_study, round_rates, scan_rates, sharpest};
+pub use self::rates::COMMON_BPS;
+use self::rates::{SAME, clocks_of, next_to_study, round_rates, scan_rates, sharpest};
 use crate::device::Records;
 use crate::{Device, DeviceError, Direction, TraceEvent, bits_on_bus};
-
-/// Bit rates in use, in bit/s, those of CiA and of vehicles, the likeliest first.
-pub const COMMON_BPS: [u32; 14] = [
-    500_000, 250_000, 125_000, 1_000_000, 100_000, 50_000, 83_333, 33_333, 800_000, 20_000, 10_000, 5_000,
-    95_238, 62_500,
-];
 
 /// Good frames in a row that make a candidate.
 const GOOD_FRAMES: u32 = 4;
@@ -42,8 +35,6 @@ const STUDY_FRAMES: u32 = 8;
 const PATIENCE: Duration = Duration::from_secs(2);
 /// How often the device is asked.
 const ASK_EVERY: Duration = Duration::from_millis(2);
-/// Rates nearer than this cannot be told apart by listening, and need not be.
-const SAME: f64 = 0.005;
 /// Frames of one rate that are measured.
 const MOST_MEASURED: u32 = 32;
 /// Frames that are kept to compare with.

@@ -26,6 +26,7 @@ pub const LINE_DELAY_NS_PER_M: f64 = 5.0;
 
 /// Why no timing comes of what was asked for.
 #[derive(Clone, Copy, Debug, PartialEq, thiserror::Error)]
+#[non_exhaustive]
 pub enum TimingError {
     /// The bit rate cannot be reached.
     #[error("{}", no_timing(*bitrate_bps, reason))]
@@ -36,7 +37,7 @@ pub enum TimingError {
         reason: NoTiming,
     },
     /// Only timings with a shorter phase segment 2 reach this bit rate.
-    #[error("no timing of {bitrate_bps} bit/s allows a jump width of {sjw} quanta; give a smaller --sjw")]
+    #[error("no timing of {bitrate_bps} bit/s allows a jump width of {sjw} quanta")]
     JumpWidth {
         /// What was asked for, in bit/s.
         bitrate_bps: u32,
@@ -51,24 +52,19 @@ pub enum TimingError {
     )]
     Segments(BitTiming),
     /// Segments that make an impossible bit rate.
-    #[error(
-        "these segments make {0} bit/s; the device takes {MIN_BITRATE_BPS} to {MAX_BITRATE_BPS}, \
-         see `cantap timing -b RATE` for what reaches a rate"
-    )]
+    #[error("these segments make {0} bit/s; the device takes {MIN_BITRATE_BPS} to {MAX_BITRATE_BPS}")]
     Rate(u32),
     /// Bits of the register that are not timing.
     #[error(
         "register value 0x{0:08X} sets bits that are not bit timing; give bits 25..24 SJW, 22..20 TS2, 19..16 TS1, \
-         9..0 BRP, and choose loopback or silent with --mode"
+         9..0 BRP"
     )]
     Register(u32),
     /// Not four numbers.
     #[error("write segments as BRP,SEG1,SEG2,SJW, such as 9,13,2,2")]
     NotSegments,
     /// bxCAN samples once.
-    #[error(
-        "this controller (bxCAN) samples each bit once; triple sampling does not exist in it: leave --triple away"
-    )]
+    #[error("this controller (bxCAN) samples each bit once; triple sampling does not exist in it")]
     TripleSampling,
 }
 

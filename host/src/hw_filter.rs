@@ -6,11 +6,12 @@
 use cantap_wire::message::{Filter as HardwareFilter, FrameKind, MAX_FILTERS};
 use cantap_wire::{Channel, Id, Refusal};
 
-use crate::filter::{EXTENDED, Filter, IdFilter, REMOTE, STANDARD_BITS};
 use crate::{Device, DeviceError};
+use cantap_trace::filter::{EXTENDED, Filter, IdFilter, REMOTE};
 
 /// Why the device passes more than the filters accept.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
 pub enum Remainder {
     /// `ID~MASK`.
     #[error("the hardware has no inverse filters (~), so the computer sorts out what they exclude")]
@@ -122,8 +123,8 @@ fn alternatives(element: &IdFilter) -> Vec<HardwareFilter> {
     let wanted = |extended: bool| mask & EXTENDED == 0 || (element.id & EXTENDED != 0) == extended;
     let mut found = Vec::new();
     // A standard identifier's upper bits are zero.
-    let standard_possible = element.id & mask & Id::MAX_EXTENDED & !STANDARD_BITS == 0;
-    for (extended, widest) in [(false, STANDARD_BITS), (true, Id::MAX_EXTENDED)] {
+    let standard_possible = element.id & mask & Id::MAX_EXTENDED & !Id::MAX_STANDARD == 0;
+    for (extended, widest) in [(false, Id::MAX_STANDARD), (true, Id::MAX_EXTENDED)] {
         if wanted(extended) && (extended || standard_possible) {
             let mask = mask & widest;
             found.push(HardwareFilter { extended, kind, id: element.id & mask, mask });

@@ -1,46 +1,22 @@
-//! The cantap host library: devices, records, time, statistics; trace files and signals behind
-//! features, so that a program that only captures stays small.
+#![doc = include_str!("../README.md")]
+//!
+//! [`Device`] is where everything begins. It speaks through a [`device::Link`], a byte stream that a serial port makes, or a
+//! device without a board. [`transmit`] sends many frames and accounts for each, [`replay`] sends them at a trace's own times,
+//! [`periodic`] checks what the device is to repeat, [`hw_filter`] has it drop what nobody wants, [`autobaud`] finds a bus's
+//! bit rate by listening, [`recovery`] brings it back from bus-off, and [`unsent`] says why something was not sent.
+
+#![forbid(unsafe_code)]
 
 pub mod autobaud;
 pub mod bit_timing;
-pub mod bits;
-#[cfg(feature = "signals")]
-pub mod condition;
 pub mod device;
-pub mod diff;
-pub mod filter;
-#[cfg(feature = "formats")]
-pub mod formats;
 pub mod hw_filter;
 pub mod periodic;
-pub mod playback;
-#[cfg(feature = "plot")]
-pub mod plot;
 pub mod recovery;
 pub mod replay;
-#[cfg(feature = "signals")]
-pub mod search;
-#[cfg(feature = "signals")]
-pub mod signals;
-#[cfg(feature = "virtual")]
-pub mod simbus;
-pub mod socketcan;
-#[cfg(feature = "stats")]
-pub mod stats;
-#[cfg(test)]
-mod testing;
-pub mod trace;
 pub mod transmit;
-#[cfg(feature = "signals")]
-pub mod trigger;
 pub mod unsent;
-#[cfg(feature = "virtual")]
-pub mod virtual_device;
-#[cfg(feature = "formats")]
-pub mod window;
 
-pub use bits::{FrameBits, bits_on_bus};
+pub use cantap_trace::{Channel, Direction, Frame, FrameBits, Id, TraceEvent, TraceRecord, bits_on_bus};
 pub use cantap_wire as wire;
-pub use cantap_wire::{Channel, Frame, Id};
-pub use device::{Address, Device, DeviceError};
-pub use trace::{Direction, TraceEvent, TraceRecord};
+pub use device::{Device, DeviceError};

@@ -10,9 +10,9 @@ use cantap_wire::message::ChannelStatus;
 use cantap_wire::record::{BusErrorKind, ErrorState, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel};
 
-use crate::bits::bits_on_bus;
 use crate::device::{Records, Transmission};
 use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
+use cantap_trace::bits::bits_on_bus;
 
 /// Frames that are due and of which none ended for so long stand still.
 pub const PATIENCE: Duration = Duration::from_secs(1);
@@ -146,9 +146,9 @@ impl Seen {
 
     fn note(&mut self, end: &Transmission) {
         let Err(reason) = end.result else { return self.moved(end.ticks) };
-        if reason == TransmitFailure::Overtaken {
-            // A period has passed; the frame still waits.
-            self.overtaken += 1;
+        if let TransmitFailure::Overtaken { periods } = reason {
+            // Periods have passed; the frame still waits.
+            self.overtaken += u64::from(periods);
             return;
         }
         self.moved(end.ticks);
@@ -180,7 +180,7 @@ impl Seen {
             Some(TransmitFailure::Aborted) => Cause::Aborted,
             Some(TransmitFailure::Closed) => Cause::Closed,
             Some(TransmitFailure::BusOff) => Cause::BusOff,
-            Some(TransmitFailure::Overtaken) => Cause::Overtaken,
+            Some(TransmitFailure::Overtaken { .. }) => Cause::Overtaken,
         }
     }
 
@@ -397,9 +397,9 @@ mod tests {
         );
         assert_eq!(cause(seen(&[ours], &[BusOff]), false), Cause::BusOff);
         // A period that passed is no frame that failed.
-        let overtaken = seen(&[ours], &[Overtaken; 5]);
-        assert_eq!((overtaken.failed(), overtaken.overtaken), (0, 5));
+        let overtaken = seen(&[ours], &[Overtaken { periods: 5 }, Overtaken { periods: 2 }]);
+        assert_eq!((overtaken.failed(), overtaken.overtaken), (0, 7));
         assert_eq!(cause(overtaken, false), Cause::Overtaken);
-        assert_eq!(cause(seen(&[ours, ack], &[Overtaken; 5]), false), Cause::Unacknowledged);
+        assert_eq!(cause(seen(&[ours, ack], &[Overtaken { periods: 5 }]), false), Cause::Unacknowledged);
     }
 }

@@ -1,160 +1,55 @@
 //! The device handle against a hand-made device at the other end of a pipe.
 
-use std::io::{Read, Write};
+#[expect(dead_code, reason = "other tests use the rest of it")]
+mod fake_device;
+
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap::device::{Link, PipeReader, PipeWriter, pipe};
+use cantap::device::{Intake, Link};
 use cantap::wire::batch::BatchWriter;
-use cantap::wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE, unseal};
-use cantap::wire::message::{ChannelStatus, DeviceMessage, Status};
-use cantap::wire::record::{ErrorState, LossStage, MAX_RECORD, encode_event, encode_received};
-use cantap::wire::{
-    Command, Event, Hello, PROTOCOL_VERSION, Received, Refusal, Reply, Request, Response, Stamp,
-};
+use cantap::wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
+use cantap::wire::message::DeviceMessage;
+use cantap::wire::record::{LossStage, MAX_RECORD, encode_received};
+use cantap::wire::{Command, Event, Hello, Received, Refusal, Reply, Request, Response, Stamp};
 use cantap::{Channel, Device, DeviceError, Direction, TraceEvent, TraceRecord};
+use fake_device::{FakeDevice, hello};
 
-/// A device that answers as its script says and sends the batches it is given.
-struct FakeDevice {
-    input: PipeReader,
-    output: PipeWriter,
-    kept: Vec<u8>,
-    batch: BatchWriter,
-    status: Status,
-}
+/// A device whose records a test writes by hand, in ticks from a second on.
+struct Scripted(FakeDevice);
 
-fn channel_status() -> ChannelStatus {
-    ChannelStatus {
-        open: None,
-        state: ErrorState::Active,
-        tec: 0,
-        rec: 0,
-        last_error: None,
-        frames: 0,
-        lost_controller: 0,
-        lost_queue: 0,
-        bus_errors: 0,
-        transmitted: 0,
-        transmit_failures: 0,
-        tx_pending: 0,
-    }
-}
+const BASE_TICKS: u64 = 1_000_000;
+/// What it says the time is: later than all of them.
+const NOW_TICKS: u64 = 1_000_000_000;
 
-fn hello() -> Hello {
-    Hello {
-        protocol: PROTOCOL_VERSION,
-        firmware: [1, 2, 3],
-        board: "fake".try_into().unwrap(),
-        serial: "0001".try_into().unwrap(),
-        channels: 2,
-        tick_hz: 12_000_000,
-        can_clock_hz: 36_000_000,
-        queue_bytes: 98_304,
-        tx_queue: 256,
-        periodic_slots: 32,
-        trigger_slots: 8,
-        filter_banks: 28,
-        capabilities: 0,
-    }
-}
-
-impl FakeDevice {
-    /// The two ends of a connection: ours for the host, and the device's.
+impl Scripted {
     fn new() -> (Link, Self) {
-        let (host_reader, output) = pipe(1 << 20);
-        let (input, host_writer) = pipe(1 << 16);
-        let status = Status {
-            ticks: 0,
-            queue_bytes: 0,
-            queue_high_water_bytes: 0,
-            bad_requests: 0,
-            temperature_decicelsius: None,
-            supply_millivolts: None,
-            channels: [channel_status(); 2],
-        };
-        let device = Self { input, output, kept: Vec::new(), batch: BatchWriter::new(), status };
-        (Link::new(host_reader, host_writer), device)
+        let (link, fake) = FakeDevice::new();
+        (link, Self(fake))
     }
 
-    /// The next request; `None` when the host is gone.
-    fn next_request(&mut self) -> Option<Request> {
-        loop {
-            if let Some(end) = self.kept.iter().position(|byte| *byte == 0) {
-                let encoded: Vec<u8> = self.kept.drain(..=end).collect();
-                if end == 0 {
-                    continue;
-                }
-                let mut message = [0; MAX_ENCODED];
-                let message = unseal(&encoded[..end], &mut message).unwrap();
-                return Some(postcard::from_bytes(message).unwrap());
-            }
-            let mut bytes = [0; 512];
-            match self.input.read(&mut bytes) {
-                Ok(0) => return None,
-                Ok(len) => self.kept.extend(&bytes[..len]),
-                Err(_) => {}
-            }
-        }
+    fn frame(&mut self, text: &str, ticks: i64, stamp: Stamp) {
+        self.0.frame(Channel::Can1, text.parse().unwrap(), stamp, ticks, BASE_TICKS);
     }
 
-    fn answer(&mut self, id: u16, result: Result<Reply, Refusal>) {
-        let mut message = [0; MAX_MESSAGE + CRC_LEN];
-        let response = DeviceMessage::Response(Response { id, result });
-        let mut out = [0; MAX_ENCODED];
-        let len = framing::encode(&response, &mut message, &mut out).unwrap();
-        self.output.write_all(&out[..len]).unwrap();
-    }
-
-    fn frame(&mut self, text: &str, ticks: i32, stamp: Stamp) {
-        let frame = text.parse().unwrap();
-        let received = Received { channel: Channel::Can1, frame, stamp, data_omitted: false };
-        let mut record = [0; MAX_RECORD];
-        let len = encode_received(&received, ticks, &mut record);
-        assert!(self.batch.push(&record[..len], 1_000_000, Some(Channel::Can1)));
-    }
-
-    fn event(&mut self, event: &Event, ticks: i32) {
-        let mut record = [0; MAX_RECORD];
-        let len = encode_event(event, ticks, &mut record);
-        assert!(self.batch.push(&record[..len], 1_000_000, None));
-    }
-
-    fn flush(&mut self) {
-        let mut out = [0; MAX_ENCODED];
-        let len = self.batch.finish(&mut out);
-        self.output.write_all(&out[..len]).unwrap();
-    }
-
-    /// Drops the batch as a bad cable would.
-    fn lose(&mut self) {
-        self.batch.finish(&mut [0; MAX_ENCODED]);
+    fn event(&mut self, event: &Event, ticks: i64) {
+        self.0.event(event, ticks, BASE_TICKS);
     }
 
     /// Answers everything; `on_open` is called after a channel opened. Ends when the host goes, or when
     /// `on_open` says so by returning false.
     fn serve(mut self, mut on_open: impl FnMut(&mut Self) -> bool + Send + 'static) -> JoinHandle<()> {
         std::thread::spawn(move || {
-            while let Some(Request { id, command }) = self.next_request() {
+            while let Some(Request { id, command }) = self.0.next_request() {
+                let is_open = matches!(command, Command::Open { .. });
                 match command {
-                    Command::Hello { .. } => self.answer(id, Ok(Reply::Hello(hello()))),
-                    Command::Time => self.answer(id, Ok(Reply::Time(1_000_000))),
-                    Command::Status => self.answer(id, Ok(Reply::Status(self.status.clone()))),
-                    Command::Open { channel, config } => {
-                        self.status.channels[channel.index()].open = config;
-                        self.answer(id, Ok(Reply::Opened(config.unwrap())));
-                        if !on_open(&mut self) {
-                            return;
-                        }
-                    }
-                    Command::Close { channel } => {
-                        self.answer(id, Ok(Reply::Done));
-                        if self.status.channels[channel.index()].open.take().is_some() {
-                            self.event(&Event::Stopped { channel }, 0);
-                            self.flush();
-                        }
-                    }
-                    _ => self.answer(id, Err(Refusal::Unsupported)),
+                    Command::Time => self.0.answer(id, Ok(Reply::Time(NOW_TICKS))),
+                    command => self.0.handle(id, &command, true),
                 }
+                if is_open && !on_open(&mut self) {
+                    return;
+                }
+                self.0.flush();
             }
         })
     }
@@ -170,22 +65,22 @@ fn rx(text: &str, late: bool) -> TraceEvent {
 
 #[test]
 fn a_session_delivers_frames_losses_and_their_places_and_ends_cleanly() {
-    let (link, fake) = FakeDevice::new();
+    let (link, fake) = Scripted::new();
     let served = fake.serve(|device| {
         device.frame("100#", 0, Stamp::Exact);
         // Two frames found in the FIFO: 58 bits of 12 ticks apart at least.
         device.frame("000#55", 12_000, Stamp::UpperBound);
         device.frame("000#55", 0, Stamp::UpperBound);
-        device.flush();
+        device.0.flush();
         device.frame("101#", 12_000, Stamp::Exact);
         device.frame("102#", 12_000, Stamp::Exact);
-        device.lose();
+        device.0.lose();
         let lost = Event::Lost { channel: Channel::Can1, stage: LossStage::Queue, count: 7, at_least: false };
         device.event(&lost, 24_000);
         device.frame("103#", 12_000, Stamp::Exact);
-        device.flush();
-        device.status.channels[0].frames = 13;
-        device.status.channels[0].lost_queue = 7;
+        device.0.flush();
+        device.0.status.channels[0].frames = 13;
+        device.0.status.channels[0].lost_queue = 7;
         true
     });
     let device = Device::over(link, "fake").unwrap();
@@ -212,13 +107,13 @@ fn a_session_delivers_frames_losses_and_their_places_and_ends_cleanly() {
 
 #[test]
 fn losses_that_went_with_the_last_batch_are_found_in_the_devices_counters() {
-    let (link, fake) = FakeDevice::new();
+    let (link, fake) = Scripted::new();
     let served = fake.serve(|device| {
         device.frame("100#", 0, Stamp::Exact);
-        device.flush();
-        device.status.channels[0].frames = 30;
-        device.status.channels[0].lost_queue = 9;
-        device.status.channels[0].lost_controller = 2;
+        device.0.flush();
+        device.0.status.channels[0].frames = 30;
+        device.0.status.channels[0].lost_queue = 9;
+        device.0.status.channels[0].lost_controller = 2;
         true
     });
     let device = Device::over(link, "fake").unwrap();
@@ -235,11 +130,11 @@ fn losses_that_went_with_the_last_batch_are_found_in_the_devices_counters() {
 
 #[test]
 fn a_device_that_vanishes_leaves_everything_received_and_then_a_clear_error() {
-    let (link, fake) = FakeDevice::new();
+    let (link, fake) = Scripted::new();
     let served = fake.serve(|device| {
         device.frame("100#", 0, Stamp::Exact);
         device.frame("101#", 600, Stamp::Exact);
-        device.flush();
+        device.0.flush();
         false
     });
     let device = Device::over(link, "fake").unwrap();
@@ -278,7 +173,7 @@ fn another_version_names_the_side_to_update() {
 fn something_that_is_no_device_is_told_from_one_that_vanished() {
     let (link, mut fake) = FakeDevice::new();
     let served = std::thread::spawn(move || {
-        let _ = fake.output.write_all(b"\x07\x07NMEA 0183 $GPGGA,\r\n\x07");
+        fake.write(b"\x07\x07NMEA 0183 $GPGGA,\r\n\x07");
         while fake.next_request().is_some() {}
     });
     let started = Instant::now();
@@ -289,12 +184,12 @@ fn something_that_is_no_device_is_told_from_one_that_vanished() {
 }
 
 #[test]
-fn a_refusal_becomes_a_sentence_that_says_what_to_do() {
-    let (link, fake) = FakeDevice::new();
+fn a_refusal_becomes_a_sentence() {
+    let (link, fake) = Scripted::new();
     let served = fake.serve(|_| true);
     let device = Device::over(link, "fake").unwrap();
     let error = device.recover(Channel::Can1).unwrap_err();
-    assert_eq!(error.to_string(), "the device refused: it cannot do that; `cantap info` shows what it can");
+    assert_eq!(error.to_string(), "the device refused: it cannot do that");
     let error = device.listen(Channel::Can1, 999_999).unwrap_err();
     assert_eq!(
         error.to_string(),
@@ -302,4 +197,34 @@ fn a_refusal_becomes_a_sentence_that_says_what_to_do() {
     );
     drop(device);
     served.join().unwrap();
+}
+
+/// Marks of USB's frames begin as soon as the session does.
+#[test]
+fn a_sessions_first_batch_may_stand_right_behind_the_answer_to_hello() {
+    let batch = |writer: &mut BatchWriter, text: &str| {
+        let frame = text.parse().unwrap();
+        let received = Received { channel: Channel::Can1, frame, stamp: Stamp::Exact, data_omitted: false };
+        let (mut record, mut out) = ([0; MAX_RECORD], [0; MAX_ENCODED]);
+        let len = encode_received(&received, 1, &mut record);
+        assert!(writer.push(&record[..len], 1_000_000, Some(Channel::Can1)));
+        let len = writer.finish(&mut out);
+        out[..len].to_vec()
+    };
+    let (mut message, mut answer) = ([0; MAX_MESSAGE + CRC_LEN], [0; MAX_ENCODED]);
+    let response = DeviceMessage::Response(Response { id: 1, result: Ok(Reply::Hello(hello())) });
+    let len = framing::encode(&response, &mut message, &mut answer).unwrap();
+    // Of the session before, the answer, and the first of this one, in a single read.
+    let mut writer = BatchWriter::new();
+    let mut bytes = batch(&mut writer, "200#");
+    bytes.extend(&answer[..len]);
+    writer.restart();
+    bytes.extend(batch(&mut writer, "100#"));
+    let mut intake = Intake::new();
+    let mut records: Vec<TraceRecord> = intake.push(&bytes, |_| {}).drain(..).collect();
+    records.append(intake.push(&batch(&mut writer, "101#"), |_| {}));
+    let events: Vec<TraceEvent> = records.into_iter().map(|record| record.event).collect();
+    assert_eq!(events, [rx("100#", false), rx("101#", false)]);
+    let counters = intake.counters();
+    assert_eq!((counters.channels[0].received, counters.channels[0].lost_link, counters.corrupt), (2, 0, 0));
 }

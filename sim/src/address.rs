@@ -13,15 +13,17 @@ use crate::traffic::{Kind, parse_log};
 
 /// Traffic that leaves the emulation close to real time.
 const DEFAULT_LOAD_PERCENT: f64 = 20.0;
+/// A crystal is not off by more than this; a USB host's frames may not be either (USB 2.0, 7.1.12: 500 ppm).
+const MOST_PPM: f64 = 500.0;
 
 /// An emulated device: `FILE.elf`, or `FILE.elf,load=50,frames=std8,bitrate=500000,seed=7`.
 ///
 /// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst,
 /// and its period), `bitrate` (bit/s; by default that of whoever opens the channel), `channels` (`1`, `2` or `both`:
 /// those with traffic), `ack` (`yes`, `no`: whether the simulated nodes acknowledge),
-/// `errors` (per cent of the frames destroyed), `seed`, `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`:
+/// `errors` (per cent of the frames destroyed), `seed`, `ppm` (how much too fast the board's crystal is), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`:
 /// time stands still while the client does not read; `real`: it goes on), `speed` (how fast time passes at most; 1 is
-/// real time), and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is
+/// real time), `timing` (`best`, `worst`: how long memories and buses keep the core waiting), and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is
 /// opened; its first interface is channel 1).
 #[derive(Clone, Debug)]
 pub struct Address {
@@ -38,7 +40,7 @@ pub struct Address {
 pub enum AddressError {
     /// There is no such option.
     #[error(
-        "there is no option '{0}'; there are load, frames, burst, bitrate, channels, ack, errors, seed, wire, pace, speed, log"
+        "there is no option '{0}'; there are load, frames, burst, bitrate, channels, ack, errors, seed, ppm, wire, pace, speed, timing, log"
     )]
     Unknown(String),
     /// The value does not fit.
@@ -148,12 +150,17 @@ impl Address {
                 let speed = value.parse().ok().filter(|speed| (0.001..=1000.0).contains(speed));
                 self.manner.speed = speed.ok_or_else(|| bad("give 0.001 to 1000; 1 is real time"))?;
             }
+            "timing" => self.options.bound = value.parse().map_err(|reason: String| bad(&reason))?,
             "wire" => {
                 self.manner.joined = match value {
                     "apart" => false,
                     "joined" => true,
                     _ => return Err(bad("give apart or joined")),
                 }
+            }
+            "ppm" => {
+                let ppm = value.parse().ok().filter(|ppm: &f64| ppm.abs() <= MOST_PPM);
+                self.options.timing.board_ppm = ppm.ok_or_else(|| bad("give -500 to 500"))?;
             }
             "errors" => self.manner.error_percent = percent()?,
             "ack" => {
@@ -209,13 +216,18 @@ fn cycles(text: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::timing::Bound;
 
     #[test]
     fn options_follow_the_file() {
-        let address: Address = "a,b.elf,load=50%,frames=std8,seed=7,channels=2,pace=real".parse().unwrap();
+        let address: Address =
+            "a,b.elf,load=50%,frames=std8,seed=7,channels=2,pace=real,timing=worst".parse().unwrap();
         assert_eq!(address.file, PathBuf::from("a,b.elf"));
         assert_eq!((address.options.seed, address.manner.pace), (7, Pace::RealTime));
-        assert_eq!(address.options.channels, [Channel::Can2]);
+        assert_eq!(
+            (&address.options.channels[..], address.options.bound),
+            (&[Channel::Can2][..], Bound::Worst)
+        );
         let load = Load::Frames { kind: Kind::Std8, percent: 50.0 };
         assert_eq!(format!("{:?}", address.options.load), format!("{load:?}"));
     }
@@ -230,6 +242,8 @@ mod tests {
             ("a.elf,burst=0/20ms", "10/960us"),
             ("a.elf,burst=1/20", "10/960us"),
             ("a.elf,speed=0", "real time"),
+            ("a.elf,ppm=501", "-500 to 500"),
+            ("a.elf,timing=fast", "best or worst"),
             ("a.elf,wire=cut", "apart or joined"),
             ("a.elf,pace=slow", "client or real"),
             ("a.elf,log=no.log", "no.log"),
@@ -250,6 +264,6 @@ mod tests {
             let error = format!("a.elf,{key}=").parse::<Address>().unwrap_err();
             assert!(matches!(error, AddressError::Value { .. }), "{key}: {error}");
         }
-        assert_eq!(keys.len(), 12);
+        assert_eq!(keys.len(), 14);
     }
 }

@@ -2,26 +2,33 @@
 //! core can be exchanged. It counts the cycles, owns flash and RAM, and mends two defects of rsemu 0.0.7
 //! around IT blocks (`docs/upstream-rsemu.md`).
 //!
-//! The core's cycles are a lower bound of a real one's: one per instruction, one more per data access,
-//! two per taken branch, 12 and 10 for exception entry and return; no flash wait states, no bus delays.
+//! By itself the core takes one cycle per instruction, one more per data access, two per taken branch, 12
+//! and 10 for exception entry and return; what it waits for beside is [`crate::timing`]'s.
 
-use std::fmt;
+mod window;
+
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use rsemu::core::error::BusError;
-use rsemu::core::space::{
-    AccessConstraints, AddressSpace, DispatchPolicy, Mapping, MemAttrs, MemOps, MemResult, Perms, RamStore,
-    Region,
-};
+use rsemu::core::space::{AddressSpace, DispatchPolicy, Mapping, MappingId, Perms, RamStore, Region};
 use rsemu::cpu::arm::v7m::sys::Exception;
 use rsemu::cpu::arm::v7m::{ArmV7m, Config, Regs, xpsr};
 
 use crate::memory_map as map;
+use crate::soc::rom;
+use crate::timing::{Bound, Delays, Speeds, Waits};
+use window::{Shared, Window};
 
 /// A table of 64 KiB pages finds memories and peripherals faster than a search; the few above it are
 /// searched for.
 const PAGES: DispatchPolicy = DispatchPolicy::Dense { page_bits: 16, cover: map::PERIPHERALS.end as u64 };
+
+/// rsemu charges each of a stack frame's words on top of the 12 and 10 cycles of exception entry and return, which
+/// contain them (ARM DDI 0439D §3.9.1).
+const FRAME: u64 = 8;
+/// More than any tail-chained return takes in rsemu, at six cycles and one for each register that is popped; one that unstacks
+/// takes 19 and more.
+const TAIL_CHAIN: u64 = 18;
 
 /// Everything the core reaches that is not memory. The addresses are absolute.
 pub trait Bus: Send + Sync {
@@ -29,56 +36,8 @@ pub trait Bus: Send + Sync {
     fn read(&self, address: u32, size: u8, now: u64) -> Option<u32>;
     /// Writes 1, 2 or 4 bytes; `None` is a bus fault.
     fn write(&self, address: u32, size: u8, value: u32, now: u64) -> Option<()>;
-}
-
-/// A window of the address space that goes to the [`Bus`].
-struct Window {
-    base: u32,
-    bus: Arc<dyn Bus>,
-    clock: Arc<AtomicU64>,
-    touched: Arc<AtomicBool>,
-}
-
-impl fmt::Debug for Window {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "Window({:#010x})", self.base)
-    }
-}
-
-impl Window {
-    /// The access is to be followed by a look at the interrupt lines.
-    fn enter(&self) -> u64 {
-        self.touched.store(true, Ordering::Relaxed);
-        self.clock.load(Ordering::Relaxed)
-    }
-}
-
-impl MemOps for Window {
-    fn read(&self, offset: u64, dst: &mut [u8], attrs: MemAttrs) -> MemResult {
-        if attrs.debug {
-            return Err(BusError::BadAccess);
-        }
-        let now = self.enter();
-        let size = dst.len() as u8;
-        let value = self.bus.read(self.base + offset as u32, size, now).ok_or(BusError::Unassigned)?;
-        dst.copy_from_slice(&value.to_le_bytes()[..dst.len()]);
-        Ok(())
-    }
-
-    fn write(&self, offset: u64, src: &[u8], attrs: MemAttrs) -> MemResult {
-        if attrs.debug {
-            return Err(BusError::BadAccess);
-        }
-        let now = self.enter();
-        let mut bytes = [0; 4];
-        bytes[..src.len()].copy_from_slice(src);
-        let value = u32::from_le_bytes(bytes);
-        self.bus.write(self.base + offset as u32, src.len() as u8, value, now).ok_or(BusError::Unassigned)
-    }
-
-    fn constraints(&self) -> AccessConstraints {
-        AccessConstraints::IO.with_widths(rsemu::core::value::Width::U8, rsemu::core::value::Width::U32)
-    }
+    /// What the program has set up that times depend on.
+    fn speeds(&self) -> Speeds;
 }
 
 /// The processor's registers, as far as anything outside needs them.
@@ -128,8 +87,9 @@ impl From<Regs> for State {
 /// The processor with its memories.
 pub struct Cpu {
     core: ArmV7m,
-    clock: Arc<AtomicU64>,
-    touched: Arc<AtomicBool>,
+    shared: Shared,
+    /// What the last step waited for.
+    waits: Waits,
     now: u64,
     state: State,
     asleep: bool,
@@ -138,6 +98,10 @@ pub struct Cpu {
     flash: Memory,
     sram: Memory,
     ccm: Memory,
+    bootloader: Memory,
+    space: Arc<AddressSpace>,
+    /// What is mapped at address 0, and whether that is the bootloader.
+    at_zero: (MappingId, bool),
 }
 
 /// A memory of the chip, shared with whoever must change it behind the core's back.
@@ -182,6 +146,8 @@ pub struct Memories {
     pub sram: Memory,
     /// Core-coupled memory at 0x1000_0000.
     pub ccm: Memory,
+    /// The ROM bootloader at 0x1FFF_0000.
+    pub bootloader: Memory,
 }
 
 impl Memories {
@@ -189,10 +155,13 @@ impl Memories {
     pub fn new() -> Self {
         let flash = Memory::new(map::FLASH.start, map::FLASH.len() as u32);
         flash.write(map::FLASH.start, &vec![0xFF; map::FLASH.len()]);
+        let bootloader = Memory::new(map::BOOTLOADER.start, map::BOOTLOADER.len() as u32);
+        bootloader.write(map::BOOTLOADER.start, &rom::contents());
         Self {
             flash,
             sram: Memory::new(map::SRAM.start, map::SRAM.len() as u32),
             ccm: Memory::new(map::CCM.start, map::CCM.len() as u32),
+            bootloader,
         }
     }
 }
@@ -205,44 +174,116 @@ impl Default for Memories {
 
 impl Cpu {
     /// A core about to leave reset. Flash is also visible at address 0, where it boots from.
-    pub fn new(memories: Memories, bus: &Arc<dyn Bus>) -> Self {
-        let clock = Arc::new(AtomicU64::new(0));
-        let touched = Arc::new(AtomicBool::new(false));
+    pub fn new(memories: Memories, bus: &Arc<dyn Bus>, bound: Bound) -> Self {
+        let shared = Shared {
+            bus: Arc::clone(bus),
+            clock: Arc::new(AtomicU64::new(0)),
+            touched: Arc::new(AtomicBool::new(false)),
+            delays: (bound == Bound::Worst).then(Arc::default),
+        };
         let space = AddressSpace::new("stm32f405", 32).with_dispatch(PAGES);
-        {
+        let at_zero = {
             let mut topology = space.topology();
             let mut put = |region: Region, base: u32, perms: Perms, priority: i32| {
                 let mapping = Mapping::new(region, base.into()).with_perms(perms).with_priority(priority);
-                topology.map_with(mapping).expect("the regions of the fixed memory map do not overlap");
+                topology.map_with(mapping).expect("the regions of the fixed memory map do not overlap")
             };
-            let ram = |name: &str, memory: &Memory| Region::ram(name, Arc::clone(&memory.store));
+            let delays = shared.delays.as_ref();
             // Reads of flash take the short way to memory; writes go to the flash controller.
-            put(ram("flash", &memories.flash), map::FLASH.start, Perms::RX, 1);
-            put(ram("boot alias", &memories.flash), 0, Perms::RX, 1);
-            put(ram("sram", &memories.sram), map::SRAM.start, Perms::RWX, 1);
-            put(ram("ccm", &memories.ccm), map::CCM.start, Perms::RW, 1);
+            put(window::memory("flash", &memories.flash, delays), map::FLASH.start, Perms::RX, 1);
+            let at_zero = put(window::memory("boot alias", &memories.flash, delays), 0, Perms::RX, 1);
+            put(
+                window::memory("bootloader", &memories.bootloader, None),
+                map::BOOTLOADER.start,
+                Perms::RX,
+                1,
+            );
+            put(window::memory("sram", &memories.sram, delays), map::SRAM.start, Perms::RWX, 1);
+            // On the D-bus, without wait states (RM0090 Rev 21 §2.3.1).
+            put(window::memory("ccm", &memories.ccm, None), map::CCM.start, Perms::RW, 1);
             for (range, perms) in [
                 (map::FLASH, Perms::WRITE),
                 (map::SYSTEM_MEMORY, Perms::RW),
                 (map::PERIPHERALS, Perms::RW),
                 (map::DBGMCU, Perms::RW),
             ] {
-                let window = Window {
-                    base: range.start,
-                    bus: Arc::clone(bus),
-                    clock: Arc::clone(&clock),
-                    touched: Arc::clone(&touched),
-                };
+                let window = Window { base: range.start, shared: shared.clone() };
                 let region = Region::io("bus", range.len() as u64, Arc::new(window));
                 put(region, range.start, perms, 0);
             }
-        }
+            at_zero
+        };
         // Four priority bits: PM0214 Rev 10 §4.3.7 (rsemu assumes three).
         let core = ArmV7m::new(Config::CORTEX_M4F.with_priority_bits(4));
-        core.attach_space(Arc::new(space));
+        let space = Arc::new(space);
+        core.attach_space(Arc::clone(&space));
         let state = core.regs().into();
-        let Memories { flash, sram, ccm } = memories;
-        Self { core, clock, touched, now: 0, state, asleep: false, lines: 0, flash, sram, ccm }
+        let Memories { flash, sram, ccm, bootloader } = memories;
+        let at_zero = (at_zero, false);
+        Self {
+            core,
+            shared,
+            waits: Waits::default(),
+            now: 0,
+            state,
+            asleep: false,
+            lines: 0,
+            flash,
+            sram,
+            ccm,
+            bootloader,
+            space,
+            at_zero,
+        }
+    }
+
+    /// Maps the bootloader, or else flash, at address 0.
+    pub fn show_at_zero(&mut self, bootloader: bool) {
+        if self.at_zero.1 == bootloader {
+            return;
+        }
+        let region = if bootloader {
+            window::memory("boot alias", &self.bootloader, None)
+        } else {
+            window::memory("boot alias", &self.flash, self.shared.delays.as_ref())
+        };
+        let mapping = Mapping::new(region, 0).with_perms(Perms::RX).with_priority(1);
+        let mut topology = self.space.topology();
+        topology.unmap(self.at_zero.0).expect("it is mapped");
+        let id = topology.map_with(mapping).expect("there is nothing else at address 0");
+        self.at_zero = (id, bootloader);
+    }
+
+    /// The core as the ROM bootloader leaves it, about to execute the program's first instruction: the program's stack and
+    /// entry, the bootloader's vectors, SysTick running, the USB interrupt enabled and pending.
+    pub fn leave_bootloader(&mut self) {
+        // The reset sequence, which takes stack and entry from flash.
+        self.core.step();
+        self.core.with_sys(|sys| {
+            sys.vtor = map::BOOTLOADER.start;
+            sys.syst_rvr = 10_000;
+            sys.syst_csr = 0b111;
+            let usb = Exception(map::OTG_FS_IRQ + 16);
+            sys.set_enable(usb, true);
+            sys.set_pending(usb, true);
+        });
+        self.state = self.core.regs().into();
+    }
+
+    /// Lets time pass before the first instruction.
+    pub fn pass(&mut self, cycles: u64) {
+        self.now += cycles;
+    }
+
+    /// Whether the next instruction is DSB.
+    pub fn at_barrier(&self) -> bool {
+        // DSB SY: F3BF 8F4F.
+        self.word(self.state.pc) == Some(0x8F4F_F3BF)
+    }
+
+    /// VTOR: where the vector table is.
+    pub fn vector_table(&self) -> u32 {
+        self.core.vtor()
     }
 
     /// Cycles since the machine was made.
@@ -268,9 +309,9 @@ impl Cpu {
     /// Whether the last steps reached beyond memory; asking clears it.
     pub fn take_touched(&self) -> bool {
         // One thread only; a swap would cost a bus lock in every step.
-        let touched = self.touched.load(Ordering::Relaxed);
+        let touched = self.shared.touched.load(Ordering::Relaxed);
         if touched {
-            self.touched.store(false, Ordering::Relaxed);
+            self.shared.touched.store(false, Ordering::Relaxed);
         }
         touched
     }
@@ -287,6 +328,9 @@ impl Cpu {
             *sys = rsemu::cpu::arm::v7m::sys::Sys::new(cpuid, bits, regions).with_fp(mvfr);
         });
         self.core.request_reset();
+        if let Some(mut delays) = self.shared.delays() {
+            *delays = Delays::default();
+        }
         self.set_lines(0);
         self.asleep = false;
         self.state = self.core.regs().into();
@@ -318,15 +362,61 @@ impl Cpu {
 
     /// One exception entry or one instruction. Returns its cycles.
     pub fn step(&mut self) -> u64 {
-        self.clock.store(self.now, Ordering::Relaxed);
+        self.shared.clock.store(self.now, Ordering::Relaxed);
         let before = self.state;
-        let cycles = if before.in_it_block() { self.step_in_it_block(before) } else { self.core.step() };
-        self.now += cycles;
+        if let Some(mut delays) = self.shared.delays() {
+            delays.begin(self.now);
+        }
+        let mut own = if before.in_it_block() { self.step_in_it_block(before) } else { self.core.step() };
         self.state = self.core.regs().into();
-        if cycles == 1 && self.state.pc == before.pc {
+        if before.exception() != self.state.exception() && own > TAIL_CHAIN {
+            own -= FRAME;
+            self.core.with_sys(|sys| sys.tick_cyccnt(FRAME.wrapping_neg()));
+        }
+        let cycles = own + self.wait();
+        self.now += cycles;
+        if own == 1 && self.state.pc == before.pc {
             self.asleep = self.core.is_asleep();
         }
+        self.complete_write_by(self.now);
         cycles
+    }
+
+    /// What the last step waited for.
+    pub fn waits(&self) -> Waits {
+        self.waits
+    }
+
+    /// The cycles that the step waited; the core's own counters go on meanwhile.
+    fn wait(&mut self) -> u64 {
+        let Some(delays) = self.shared.delays() else { return 0 };
+        self.waits = delays.end();
+        drop(delays);
+        let cycles = self.waits.total();
+        if cycles > 0 {
+            self.tick(cycles);
+        }
+        cycles
+    }
+
+    /// Makes a write that has reached its peripheral by `now`.
+    fn complete_write_by(&self, now: u64) {
+        let due = self.shared.delays().and_then(|delays| delays.posted_at()).is_some_and(|at| at <= now);
+        if due {
+            self.shared.complete_write();
+        }
+    }
+
+    /// SysTick and CYCCNT count on. Whether SysTick now wants its exception.
+    fn tick(&self, cycles: u64) -> bool {
+        self.core.with_sys(|sys| {
+            sys.tick_cyccnt(cycles);
+            let pends = sys.tick_systick(cycles) && sys.syst_csr & 2 != 0;
+            if pends {
+                sys.set_pending(Exception::SYSTICK, true);
+            }
+            pends
+        })
     }
 
     /// rsemu does not stack ITSTATE when an exception comes, so the rest of the block would run
@@ -354,22 +444,22 @@ impl Cpu {
         }
     }
 
-    /// Lets a sleeping core's time pass until `until`, or until its own SysTick is due if that is
-    /// sooner.
+    /// Lets a sleeping core's time pass until `until`, or until its own SysTick is due or a write reaches its
+    /// peripheral if that is sooner.
     pub fn advance_idle(&mut self, until: u64) {
-        let mut span = until.saturating_sub(self.now).max(1);
+        let posted_at = self.shared.delays().and_then(|delays| delays.posted_at());
+        let mut span = until.min(posted_at.unwrap_or(until)).saturating_sub(self.now).max(1);
         self.core.with_sys(|sys| {
             if sys.syst_csr & 1 != 0 && sys.syst_rvr != 0 {
                 let left = if sys.syst_cvr == 0 { sys.syst_rvr + 1 } else { sys.syst_cvr };
                 span = span.min(left.into());
             }
-            sys.tick_cyccnt(span);
-            if sys.tick_systick(span) && sys.syst_csr & 2 != 0 {
-                sys.set_pending(Exception::SYSTICK, true);
-                self.asleep = false;
-            }
         });
+        if self.tick(span) {
+            self.asleep = false;
+        }
         self.now += span;
+        self.complete_write_by(self.now);
     }
 
     /// The memory that holds `address`, if one does.
@@ -380,6 +470,8 @@ impl Cpu {
             Some(&self.sram)
         } else if map::CCM.contains(&address) {
             Some(&self.ccm)
+        } else if map::BOOTLOADER.contains(&address) {
+            Some(&self.bootloader)
         } else {
             None
         }

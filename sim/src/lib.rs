@@ -3,7 +3,10 @@
 //!
 //! It depends on the wire protocol's types and never on the firmware's library: it is an independent
 //! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
-//! here looks at the host's clock, so the same seed gives the same run, byte for byte.
+//! here looks at the host's clock, so the same seed gives the same run, byte for byte. How long the core waits for
+//! its memories is one of two bounds ([`timing`]).
+
+#![forbid(unsafe_code)]
 
 pub mod address;
 pub mod bus;
@@ -18,6 +21,7 @@ pub mod memory_map;
 pub mod otg;
 pub mod peripheral;
 pub mod probe;
+pub mod profile;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;
@@ -25,10 +29,12 @@ pub mod run;
 pub mod soc;
 pub mod stop;
 pub mod stream;
+pub mod timing;
 pub mod trace;
 pub mod traffic;
 pub mod usb;
 pub mod usb_host;
+pub mod usbip;
 
 pub use elf::{ElfError, Image};
 pub use machine::{Machine, Setup};

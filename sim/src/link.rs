@@ -130,7 +130,7 @@ impl Served {
     /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
     /// of `options` from now on, any other and a replayed log as long as the channel is open.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
-        let setup = Setup { joined: manner.joined, ..Setup::default() };
+        let setup = Setup { joined: manner.joined, bound: options.bound, ..Setup::default() };
         let mut rig = Rig::new(image, setup, options.timing);
         rig.plug_in()?;
         let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
@@ -192,7 +192,9 @@ impl Served {
     pub fn until(&mut self, seconds: Option<Duration>, client: &impl Client) -> Result<(), ServeError> {
         let cycles = seconds.map(|seconds| (seconds.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64);
         let end = cycles.map_or(u64::MAX, |cycles| self.rig.now().saturating_add(cycles));
-        let millisecond = Duration::from_millis(1).div_f64(self.manner.speed);
+        // A board with a fast crystal has its cycles behind it sooner.
+        let millisecond =
+            Duration::from_millis(1).div_f64(self.manner.speed * self.options.timing.board_rate());
         let mut due = Instant::now();
         while self.rig.now() < end {
             self.hand_over(client)?;

@@ -1,16 +1,21 @@
 //! The machine: core, chip and buses in one time.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use crate::Peripheral;
 use crate::bus::Wire;
+use crate::can::MasterReset;
 use crate::cpu::{Bus, Cpu, Memories, State};
 use crate::elf::Image;
 use crate::memory_map as map;
 use crate::probe::{Change, Probe};
-use crate::soc::rcc::ResetCause;
+use crate::profile::Profile;
+use crate::soc::rcc::{CRYSTAL_START, Crystal, ResetCause};
+use crate::soc::rom::{self, Start};
 use crate::soc::{Board, CAN_IRQS, SharedBoard};
 use crate::stop::{Reason, Stopped};
+use crate::timing::Bound;
 use crate::trace::Trace;
 
 /// How often, in steps, what the core does not report is looked at: a reset request, a lock-up.
@@ -26,20 +31,37 @@ const PANIC_FUNCTIONS: [&str; 4] =
 /// How a machine is set up.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Setup {
-    /// The board's crystal in Hz.
-    pub hse_hz: u64,
+    /// The board's crystal.
+    pub crystal: Crystal,
+    /// How the chip was started.
+    pub start: Start,
     /// Both controllers on one bus.
     pub joined: bool,
     /// A reset that the firmware asks for ends the run, rather than restarting it.
     pub stop_on_reset: bool,
     /// A watchdog reset restarts the firmware, rather than ending the run.
     pub survive_watchdog: bool,
+    /// The firmware's own handlers deal with panics and faults, rather than these ending the run.
+    pub survive_failures: bool,
+    /// How long memories and buses keep the core waiting.
+    pub bound: Bound,
+    /// What a CAN controller's master reset takes with it.
+    pub master_reset: MasterReset,
 }
 
 impl Default for Setup {
-    /// The Olimex STM32-P405's crystal, two buses, restart on request, end on a watchdog reset.
+    /// The Olimex STM32-P405's crystal, two buses, restart on request, end on a watchdog reset, a core that never waits.
     fn default() -> Self {
-        Self { hse_hz: 8_000_000, joined: false, stop_on_reset: false, survive_watchdog: false }
+        Self {
+            crystal: Crystal { hz: 8_000_000, start: Some(CRYSTAL_START) },
+            start: Start::PowerOn,
+            joined: false,
+            stop_on_reset: false,
+            survive_watchdog: false,
+            survive_failures: false,
+            bound: Bound::Best,
+            master_reset: MasterReset::default(),
+        }
     }
 }
 
@@ -51,6 +73,7 @@ pub struct Machine {
     setup: Setup,
     probe: Probe,
     trace: Option<Trace>,
+    profile: Option<Profile>,
     panics: Vec<u32>,
     held_lines: u128,
     lines: u128,
@@ -58,6 +81,12 @@ pub struct Machine {
     stalled_until: u64,
     look_in: u32,
     resets: u64,
+    /// A peripheral's clock was just switched on.
+    awaits_clock: bool,
+    /// Whether the chip has run at all.
+    started: bool,
+    /// Which exceptions have reached each attached device, by the device's interrupt.
+    accessors: BTreeMap<u16, BTreeSet<u16>>,
     /// The capture interrupts' priority, looked up when BASEPRI is first seen set.
     capture_priority: Option<u8>,
 }
@@ -69,13 +98,14 @@ impl Machine {
         for (address, bytes) in image.segments() {
             memories.flash.write(address, bytes);
         }
-        let mut board = Board::new(&memories, setup.hse_hz);
+        let mut board = Board::new(&memories, setup.crystal);
+        board.can.set_master_reset(setup.master_reset);
         if setup.joined {
             board.wires = [Wire::new(&[0, 1]), Wire::new(&[])];
         }
         let board = Arc::new(Mutex::new(board));
         let bus: Arc<dyn Bus> = Arc::new(SharedBoard(Arc::clone(&board)));
-        let cpu = Cpu::new(memories, &bus);
+        let cpu = Cpu::new(memories, &bus, setup.bound);
         let panics = PANIC_FUNCTIONS.iter().filter_map(|name| image.address_of(name)).collect();
         Self {
             cpu,
@@ -84,6 +114,7 @@ impl Machine {
             setup,
             probe: Probe::default(),
             trace: None,
+            profile: None,
             panics,
             held_lines: 0,
             lines: 0,
@@ -91,6 +122,9 @@ impl Machine {
             stalled_until: 0,
             look_in: LOOK_EVERY,
             resets: 0,
+            awaits_clock: false,
+            started: false,
+            accessors: BTreeMap::new(),
             capture_priority: None,
         }
     }
@@ -162,6 +196,16 @@ impl Machine {
         self.trace.take()
     }
 
+    /// Records where the cycles go from now on.
+    pub fn start_profile(&mut self) {
+        self.profile = Some(Profile::default());
+    }
+
+    /// Ends that and returns it.
+    pub fn take_profile(&mut self) -> Option<Profile> {
+        self.profile.take()
+    }
+
     /// The exceptions that ran since the probe was reset, `span` cycles ago: name, how often, and their share of the time in per cent,
     /// without what interrupted them.
     pub fn tasks(&self, span: u64) -> Vec<(String, u64, f64)> {
@@ -172,6 +216,16 @@ impl Machine {
                 (self.exception_name(number), self.probe().entries(number), share)
             })
             .collect()
+    }
+
+    /// What runs as exception `number`: its name, or that it is none.
+    pub fn task_name(&self, number: u16) -> String {
+        if number == 0 { "thread mode".to_owned() } else { self.exception_name(number) }
+    }
+
+    /// The exceptions that have reached an attached device's registers, by the device's interrupt; 0 is thread mode.
+    pub fn accessors(&self, irq: u16) -> impl Iterator<Item = u16> {
+        self.accessors.get(&irq).into_iter().flatten().copied()
     }
 
     /// An exception's name: its handler's, where the vector table and the symbols tell it.
@@ -186,6 +240,12 @@ impl Machine {
 
     /// Runs until core cycle `until`, or a few beyond: an instruction is never cut.
     pub fn run_until(&mut self, until: u64) -> Result<(), Stopped> {
+        if !self.started {
+            self.started = true;
+            if self.setup.start == Start::Bootloader {
+                rom::leave(&mut lock(&self.board), &mut self.cpu);
+            }
+        }
         self.refresh();
         while self.cpu.now() < until {
             if self.cpu.now() >= self.next_event {
@@ -215,17 +275,26 @@ impl Machine {
 
     fn step(&mut self) -> Result<(), Stopped> {
         let before = *self.cpu.state();
+        if self.awaits_clock && self.cpu.at_barrier() {
+            lock(&self.board).barrier();
+        }
         let cycles = self.cpu.step();
         let after = *self.cpu.state();
         let change = self.probe.step(&before, &after, cycles);
+        if let Some(profile) = &mut self.profile {
+            profile.step(&before, &after, cycles, self.cpu.waits());
+        }
         if let Some(change) = change {
             self.exception_changed(change)?;
         }
         self.follow_masks(&after);
         if self.cpu.take_touched() {
+            if let Some(irq) = lock(&self.board).take_reached() {
+                self.accessors.entry(irq).or_default().insert(before.exception());
+            }
             self.refresh();
         }
-        if self.panics.contains(&after.pc) {
+        if !self.setup.survive_failures && self.panics.contains(&after.pc) {
             return Err(self.stopped(Reason::Panic));
         }
         self.look_in -= 1;
@@ -250,9 +319,10 @@ impl Machine {
         match change {
             Change::Enter(HARD_FAULT) | Change::Chain(_, HARD_FAULT) => {
                 let mut stopped = self.stopped(Reason::HardFault(self.cpu.fault_status()));
-                // There is no ROM to fetch from.
-                if map::SYSTEM_MEMORY.contains(&stopped.pc) {
+                if stopped.pc == rom::ENTRY & !1 {
                     stopped.reason = Reason::Bootloader;
+                } else if self.setup.survive_failures {
+                    return Ok(());
                 }
                 Err(stopped)
             }
@@ -326,6 +396,8 @@ impl Machine {
         let mut board = lock(&self.board);
         self.lines = board.lines() & !self.held_lines;
         self.next_event = board.next_event().unwrap_or(u64::MAX);
+        self.awaits_clock = board.awaits_clock();
+        self.cpu.show_at_zero(board.memory_at_zero() == rom::SYSTEM_MEMORY);
         let stall = board.take_stall();
         if stall > 0 {
             self.stalled_until = self.cpu.now() + stall;

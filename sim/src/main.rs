@@ -10,7 +10,9 @@ use anyhow::Context;
 use cantap_sim::CYCLES_PER_SECOND;
 use cantap_sim::elf::{ElfError, Image};
 use cantap_sim::run::{self, Load, Options, Report};
+use cantap_sim::timing::Bound;
 use cantap_sim::traffic::{Kind, parse_log};
+use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
 use clap::{Parser, Subcommand};
 
@@ -35,6 +37,21 @@ struct Cli {
 enum Command {
     /// Put traffic on the buses, capture it over USB and check every frame.
     Run(Args),
+    /// Serve the board to a kernel as a USB device, by USB/IP or usbredir.
+    Usbip(UsbipArgs),
+}
+
+/// The command line of `usbip`.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Listens on free ports of 127.0.0.1 and writes them to FOLDER/ports as variables of a shell: USBIP for\n\
+                  `usbip --tcp-port PORT attach -r HOST -b 1-1`, REDIR for QEMU's usb-redir, CONTROL for lines that change buses and cable (docs/emulator.md)."
+)]
+struct UsbipArgs {
+    /// The firmware's ELF, as `cargo xtask firmware` makes it.
+    firmware: PathBuf,
+    /// Where the ports are written, and what a line asks for.
+    folder: PathBuf,
 }
 
 /// The command line of `run`.
@@ -69,21 +86,30 @@ pub struct Args {
     /// The host stops reading for this time, in the middle of the run.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     stall: Option<Duration>,
+    /// The host is behind a high-speed hub, and so many microframes pass from one packet to the next: 2 is 0.26 MB/s.
+    #[arg(long, value_name = "MICROFRAMES", default_value = "0")]
+    hub: u32,
     /// Replay this candump log at its own times, in place of generated frames.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["load", "frames"])]
     replay: Option<PathBuf>,
     /// Seed of the traffic. The same seed gives the same run.
     #[arg(long, default_value = "1")]
     seed: u64,
+    /// How long memories and buses keep the core waiting: best (not at all) or worst (as long as the manuals allow).
+    #[arg(long, value_name = "BOUND", default_value = "best")]
+    timing: Bound,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
     /// Write a picture of interrupts, masked windows, sleep, FIFO fills and frames (Chrome trace, Perfetto).
     #[arg(long, value_name = "FILE")]
     trace: Option<PathBuf>,
+    /// Print where the core's cycles go, by interrupt and function.
+    #[arg(long, conflicts_with = "json")]
+    profile: bool,
     /// Serve the device on a pseudo-terminal, whose name is printed, rather than capture from it. Time stands
     /// still while the client does not read.
-    #[arg(long, conflicts_with_all = ["stall", "json", "trace"])]
+    #[arg(long, conflicts_with_all = ["stall", "json", "trace", "profile"])]
     pty: bool,
     /// With --pty: time goes on while the client does not read.
     #[arg(long, requires = "pty")]
@@ -127,8 +153,11 @@ fn percent(text: &str) -> Result<f64, String> {
 }
 
 fn main() -> ExitCode {
-    let Command::Run(args) = Cli::parse().command;
-    match run(&args) {
+    let result = match Cli::parse().command {
+        Command::Run(args) => run(&args),
+        Command::Usbip(args) => usbip(&args),
+    };
+    match result {
         Ok(code) => code,
         Err(error) => {
             eprintln!("cantap-sim: {error:#}");
@@ -137,11 +166,20 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let image = Image::open(&args.firmware).map_err(|error| match error {
+fn open(firmware: &Path) -> anyhow::Result<Image> {
+    Image::open(firmware).map_err(|error| match error {
         ElfError::Unreadable { .. } => anyhow::anyhow!("{error}"),
-        _ => anyhow::anyhow!("{}: {error}", args.firmware.display()),
-    })?;
+        _ => anyhow::anyhow!("{}: {error}", firmware.display()),
+    })
+}
+
+fn usbip(args: &UsbipArgs) -> anyhow::Result<ExitCode> {
+    cantap_sim::usbip::serve(open(&args.firmware)?, &args.folder)?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let image = open(&args.firmware)?;
     let options = options(args)?;
     if args.pty {
         serve::pty(image, options, args.seconds, args.real_time)?;
@@ -175,7 +213,10 @@ fn options(args: &Args) -> anyhow::Result<Options> {
         bitrate_bps: args.bitrate,
         stall: args.stall,
         seed: args.seed,
+        bound: args.timing,
+        timing: Timing::default().behind_hub(args.hub),
         trace: args.trace.is_some(),
+        profile: args.profile,
         ..Options::default()
     };
     let bitrate_bps = args.bitrate.unwrap_or(run::DEFAULT_BITRATE_BPS);
@@ -226,11 +267,14 @@ fn print(out: &mut impl Write, report: &Report) -> io::Result<()> {
     writeln!(out, "stamping interrupt masked for {:.0} ns at most", report.masked_ns_max)?;
     writeln!(
         out,
-        "core: {:.1} % awake, {:.1} cycles per frame in the receive interrupts (cycles are a lower bound)",
-        report.cpu_load_pct, report.isr_cycles_per_frame
+        "core: {:.1} % awake, {:.1} cycles per frame in the receive interrupts ({} timing)",
+        report.cpu_load_pct, report.isr_cycles_per_frame, report.bound
     )?;
     for (name, entries, share) in &report.tasks {
         writeln!(out, "  {name}: {entries} times, {share:.2} %")?;
+    }
+    if let Some(profile) = &report.profile {
+        write!(out, "{profile}")?;
     }
     writeln!(out, "emulation: {:.2} s per emulated second", report.host_s_per_emulated_s)?;
     for odd in &report.odd_accesses {

@@ -10,8 +10,12 @@ pub const CCM: Range<u32> = 0x1000_0000..0x1001_0000;
 pub const SRAM: Range<u32> = 0x2000_0000..0x2002_0000;
 /// ROM bootloader, OTP area, unique ID, flash size, calibration values, option bytes.
 pub const SYSTEM_MEMORY: Range<u32> = 0x1FFF_0000..0x2000_0000;
+/// The part of it that is the ROM bootloader.
+pub const BOOTLOADER: Range<u32> = 0x1FFF_0000..0x1FFF_7800;
 /// Every peripheral of APB1, APB2, AHB1 and AHB2.
 pub const PERIPHERALS: Range<u32> = 0x4000_0000..0x6000_0000;
+/// The registers of RCC and of the flash interface, which set the speed of everything.
+pub const CLOCKS_AND_FLASH: Range<u32> = 0x4002_3800..0x4002_4000;
 /// The MCU's debug component, in the vendor part of the private peripheral bus.
 pub const DBGMCU: Range<u32> = 0xE004_2000..0xE004_2400;
 

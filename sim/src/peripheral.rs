@@ -27,6 +27,10 @@ pub trait Peripheral {
     fn next_event(&self) -> Option<u64>;
     /// Does everything that is due at or before `now`.
     fn advance(&mut self, now: u64);
+    /// When the device last pulsed its trigger output, if it did since the last call: OTG_FS does at each start of frame.
+    fn take_trigger(&mut self) -> Option<u64> {
+        None
+    }
     /// A system reset of the chip: registers go back to their reset values.
     fn reset(&mut self, _now: u64) {}
 }

@@ -1,6 +1,6 @@
 //! What a run costs: cycles per exception and asleep, the longest time in which interrupts were
-//! masked, how full the receive FIFOs became. Cycles are a lower bound of a real chip's (see
-//! [`crate::cpu`]).
+//! masked, how full the receive FIFOs became. What a cycle count means depends on the bound (see
+//! [`crate::timing`]).
 
 use crate::cpu::State;
 

@@ -3,7 +3,7 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
-use cantap_wire::message::{ChannelConfig, Hello, Status};
+use cantap_wire::message::{ChannelConfig, EndReason, Hello, Status};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Record, Refusal, Reply, Response};
 
 use crate::bus::{BitTime, BusFrame, Node, Source, Wire};
@@ -86,6 +86,8 @@ pub struct Rig {
     /// From a cut to the next greeting: records are remains of the session before.
     between_sessions: bool,
     events: Vec<(u64, Event)>,
+    /// The device has ended the session by itself.
+    ended: Option<(u64, EndReason)>,
     last_bytes_at: u64,
     /// Places in each channel's transmit queue, once the device has said.
     tx_queue: usize,
@@ -111,6 +113,7 @@ impl Rig {
             booked: [false; CHANNELS],
             between_sessions: false,
             events: Vec::new(),
+            ended: None,
             last_bytes_at: 0,
             tx_queue: 0,
             periodic_slots: 0,
@@ -201,13 +204,15 @@ impl Rig {
         if let Some(recording) = &mut self.recording {
             recording.extend_from_slice(&bytes);
         }
-        let Self { session, ledger, events, between_sessions, .. } = self;
+        let Self { session, ledger, events, ended, between_sessions, .. } = self;
         session.take(&bytes, |heard| {
             if *between_sessions {
                 return;
             }
-            if let Heard::Record(ticks, Record::Event(event)) = &heard {
-                events.push((*ticks, *event));
+            match &heard {
+                Heard::Record(ticks, Record::Event(event)) => events.push((*ticks, *event)),
+                Heard::Ended(ticks, reason) => *ended = Some((*ticks, *reason)),
+                Heard::Record(..) | Heard::BatchesLost(_) => {}
             }
             ledger.heard(&heard);
         });
@@ -250,6 +255,7 @@ impl Rig {
             return Err(wrong("Hello", &reply));
         };
         self.between_sessions = false;
+        self.ended = None;
         self.tx_queue = hello.tx_queue.into();
         self.periodic_slots = hello.periodic_slots.into();
         self.follow_clock(hello.tick_hz);
@@ -335,6 +341,15 @@ impl Rig {
         }
     }
 
+    /// Closes the books of a session that the device ended by itself: it has delivered everything.
+    pub fn follow_session_end(&mut self) {
+        for channel in Channel::ALL {
+            if std::mem::take(&mut self.booked[channel.index()]) {
+                self.ledger.close(channel, true);
+            }
+        }
+    }
+
     /// The device's status.
     pub fn status(&mut self) -> Result<Status, RigError> {
         match self.ask(Command::Status)? {
@@ -382,6 +397,11 @@ impl Rig {
     /// Events that the device reported, with their device times.
     pub fn events(&self) -> &[(u64, Event)] {
         &self.events
+    }
+
+    /// When the device ended the session by itself, by its own time, and why.
+    pub fn session_end(&self) -> Option<(u64, EndReason)> {
+        self.ended
     }
 
     /// Keeps the bytes that the device sends from now on.

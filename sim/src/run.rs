@@ -11,8 +11,10 @@ use crate::bus::bits::bus_bits;
 use crate::capture::{Losses, Stamps};
 use crate::elf::Image;
 use crate::machine::{Machine, Setup};
+use crate::profile::Table;
 use crate::rig::{MS, Rig, RigError};
-use crate::soc::{CAN_IRQS, OddAccess};
+use crate::soc::{CAPTURE_IRQS, OddAccess};
+use crate::timing::Bound;
 use crate::trace::Trace;
 use crate::traffic::{Bursts, Kind, Script, Traffic};
 use crate::usb_host::Timing;
@@ -68,8 +70,12 @@ pub struct Options {
     pub seed: u64,
     /// How the USB host keeps time.
     pub timing: Timing,
+    /// How long memories and buses keep the core waiting.
+    pub bound: Bound,
     /// Whether to record a picture of the run.
     pub trace: bool,
+    /// Whether to record where the core's cycles go.
+    pub profile: bool,
 }
 
 impl Default for Options {
@@ -83,7 +89,9 @@ impl Default for Options {
             stall: None,
             seed: 1,
             timing: Timing::default(),
+            bound: Bound::default(),
             trace: false,
+            profile: false,
         }
     }
 }
@@ -110,6 +118,8 @@ pub struct ChannelReport {
 pub struct Report {
     /// Emulated seconds of traffic.
     pub seconds: f64,
+    /// How long memories and buses kept the core waiting.
+    pub bound: Bound,
     /// Each captured channel.
     pub channels: Vec<ChannelReport>,
     /// Bytes over USB per frame delivered, everything included.
@@ -130,6 +140,8 @@ pub struct Report {
     pub host_s_per_emulated_s: f64,
     /// Share of the traffic's time for each exception that ran: name, entries, per cent.
     pub tasks: Vec<(String, u64, f64)>,
+    /// Where the cycles went, as a table, if it was asked for.
+    pub profile: Option<String>,
     /// What broke the law of counting.
     pub faults: Vec<String>,
     /// Accesses to registers that no model knows, or that the hardware would not take.
@@ -141,7 +153,8 @@ pub struct Report {
 /// Runs `image` and captures from it.
 pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, Trace)>), RigError> {
     let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
-    let mut rig = Rig::new(image, Setup::default(), options.timing);
+    let setup = Setup { bound: options.bound, ..Setup::default() };
+    let mut rig = Rig::new(image, setup, options.timing);
     let hello = rig.connect()?;
     for channel in &options.channels {
         rig.listen(*channel, bitrate_bps)?;
@@ -158,6 +171,9 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     if options.trace {
         rig.machine.start_trace();
     }
+    if options.profile {
+        rig.machine.start_profile();
+    }
     let wall = Instant::now();
     if let Some(stall) = options.stall {
         let stall = (stall.as_secs_f64() * CYCLES_PER_SECOND as f64) as u64;
@@ -171,6 +187,11 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     let span = rig.now() - from;
     let costs = Costs::of(&rig.machine, span);
     let trace = rig.machine.take_trace();
+    let profile = rig.machine.take_profile().map(|profile| {
+        let rows = profile.by_function(rig.machine.image());
+        let name_of = &|number| rig.machine.task_name(number);
+        Table { rows: &rows, name_of, span, least_percent: 0.01 }.to_string()
+    });
 
     // A frame that began before the end of the traffic ends after it.
     rig.run_for(MARGIN)?;
@@ -189,6 +210,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     }
     let report = Report {
         seconds,
+        bound: options.bound,
         channels: options
             .channels
             .iter()
@@ -203,6 +225,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
         isr_cycles_per_frame: costs.capture_cycles as f64 / delivered.max(1) as f64,
         host_s_per_emulated_s: took / seconds,
         tasks: costs.tasks,
+        profile,
         ok: faults.is_empty() && rig.ledger.holds(),
         odd_accesses: rig.machine.board().odd_accesses(),
         faults,
@@ -222,7 +245,9 @@ impl Options {
                 Box::new(Bursts::new(*kind, seed, *frames, *period, from, until))
             }
             Load::Replay(logs) => {
-                let frames = logs[channel.index()].iter().map(|(at, frame)| (origin + at, *frame));
+                // The log's times are the world's; the board's crystal may count more or fewer cycles meanwhile.
+                let place = |at: u64| origin + (at as f64 * self.timing.board_rate()) as u64;
+                let frames = logs[channel.index()].iter().map(|(at, frame)| (place(*at), *frame));
                 Box::new(Script::new(frames.filter(|(at, _)| (from..until).contains(at)).collect()))
             }
         }
@@ -254,11 +279,11 @@ struct Costs {
 impl Costs {
     fn of(machine: &Machine, span: u64) -> Self {
         let probe = machine.probe();
-        let receive_lines = CAN_IRQS.iter().flat_map(|irqs| &irqs[1..3]);
+        let capture = CAPTURE_IRQS.iter().flatten();
         Self {
             masked_ns: probe.longest_masked().cycles as f64 * 1000.0 / CYCLES_PER_US as f64,
             load_pct: probe.load_percent(machine.now()),
-            capture_cycles: receive_lines.map(|irq| probe.cycles(FIRST_INTERRUPT + irq)).sum(),
+            capture_cycles: capture.map(|irq| probe.cycles(FIRST_INTERRUPT + irq)).sum(),
             tasks: machine.tasks(span),
         }
     }
@@ -284,6 +309,7 @@ impl Report {
         let lost = |stage: fn(&Losses) -> u64| self.channels.iter().map(|one| stage(&one.lost)).sum::<u64>();
         json!({
             "seconds": rounded(self.seconds, 3),
+            "timing": self.bound.to_string(),
             "channels": channels,
             "wire_bytes_per_frame": rounded(self.wire_bytes_per_frame, 3),
             "queue_bytes": self.queue_bytes,

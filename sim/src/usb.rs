@@ -3,23 +3,30 @@
 
 use crate::Peripheral;
 use crate::otg::Otg;
-use crate::usb_host::{Timing, UsbHost};
+use crate::usb_host::{CdcDriver, HostDriver, Timing, UsbHost};
 
 /// OTG_FS and the host that it is connected to.
 #[derive(Debug)]
-pub struct UsbPort {
+pub struct UsbPort<D = CdcDriver> {
     otg: Otg,
-    host: UsbHost,
+    host: UsbHost<D>,
 }
 
 impl UsbPort {
-    /// A port whose cable is out.
+    /// A port whose cable is out. The emulator's own host is at the other end.
     pub fn new(timing: Timing) -> Self {
-        Self { otg: Otg::new(), host: UsbHost::new(timing) }
+        Self::with_driver(timing, CdcDriver::new())
+    }
+}
+
+impl<D: HostDriver> UsbPort<D> {
+    /// The same, with a driver of somebody else's.
+    pub fn with_driver(timing: Timing, driver: D) -> Self {
+        Self { otg: Otg::new(), host: UsbHost::new(timing, driver) }
     }
 
     /// The host, brought up to `now`, with the controller that some of its actions need.
-    pub fn host(&mut self, now: u64) -> (&mut UsbHost, &mut Otg) {
+    pub fn host(&mut self, now: u64) -> (&mut UsbHost<D>, &mut Otg) {
         self.host.advance(&mut self.otg, now);
         (&mut self.host, &mut self.otg)
     }
@@ -30,7 +37,7 @@ impl UsbPort {
     }
 }
 
-impl Peripheral for UsbPort {
+impl<D: HostDriver> Peripheral for UsbPort<D> {
     fn read(&mut self, offset: u32, size: u8, now: u64) -> u32 {
         self.host.advance(&mut self.otg, now);
         let word = self.otg.read(offset & !3);
@@ -53,6 +60,10 @@ impl Peripheral for UsbPort {
 
     fn advance(&mut self, now: u64) {
         self.host.advance(&mut self.otg, now);
+    }
+
+    fn take_trigger(&mut self) -> Option<u64> {
+        self.host.take_sof()
     }
 
     fn reset(&mut self, now: u64) {

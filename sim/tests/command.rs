@@ -46,6 +46,7 @@ fn a_run_prints_one_object_with_the_demos_keys_and_its_own() {
         "queue_high_water_bytes",
         "seconds",
         "stamp_latency_ns",
+        "timing",
         "wire_bytes_per_frame",
     ];
     assert_eq!(keys, expected);

@@ -3,7 +3,6 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::{Outcome, Request as UsbRequest, Timing};
@@ -14,7 +13,7 @@ const MEGABIT: u32 = 1_000_000;
 const CAN1: Channel = Channel::Can1;
 
 fn connected() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty());
     rig.connect().unwrap();
     Some(rig)
 }

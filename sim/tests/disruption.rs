@@ -4,10 +4,11 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
+use cantap_sim::otg::Misuse;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::{Status, Timing, UsbHost};
+use cantap_wire::message::EndReason;
 use cantap_wire::{Channel, Command};
 
 /// Random instants in the test; each costs about a tenth of a second.
@@ -72,7 +73,7 @@ impl Disruption {
 /// A board on a host that resets a new device twice, or once.
 fn board(second_reset: bool) -> Option<Rig> {
     let timing = Timing { second_reset, ..Timing::hasty() };
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), timing);
+    let mut rig = Rig::new(common::firmware()?, common::setup(), timing);
     rig.plug_in().unwrap();
     let from = rig.now();
     for channel in Channel::ALL {
@@ -128,9 +129,7 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
         captured += rig.ledger.delivered_count(Channel::Can1) + rig.ledger.delivered_count(Channel::Can2);
         assert_eq!(rig.machine.resets(), 0, "the firmware was restarted");
         assert_eq!(rig.machine.board().odd_accesses(), []);
-        // The driver looks into the receive queue once more after it flushed it at a reset; that is not counted here.
-        let misuse = rig.with_host(|_, otg| otg.misuse());
-        assert_eq!((misuse.tx_overflows, misuse.unknown_registers, misuse.bad_fifo_layout), (0, 0, 0));
+        assert_eq!(rig.with_host(|_, otg| otg.misuse()), Misuse::default());
         for channel in Channel::ALL {
             assert_eq!(rig.dominant_bits(channel), 0, "a channel that only listens drove the bus");
         }
@@ -143,7 +142,7 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
 fn an_enumeration_may_be_cut_off_anywhere() {
     let Some(image) = common::firmware() else { return };
     let mut random = fastrand::Rng::with_seed(7);
-    let mut rig = Rig::new(image, Setup::default(), Timing::hasty());
+    let mut rig = Rig::new(image, common::setup(), Timing::hasty());
     rig.with_host(|host, _| host.plug());
     for _ in 0..30 {
         rig.run_for(random.u64(..60 * MS)).unwrap();
@@ -194,4 +193,38 @@ fn resume_needs_no_enumeration() {
     assert!(rig.ledger.delivered_count(Channel::Can1) > 20);
     assert_eq!(rig.with_host(|host, _| host.counters().enumerations), 1);
     rig.ask(Command::Status).unwrap();
+}
+
+/// A laptop that sleeps and wakes with the port open: all that was captured until then is delivered, and the device says that the
+/// session has ended, and when. Nothing is missing, and nobody waits for frames that will not come.
+#[test]
+fn a_host_that_wakes_is_told_that_the_session_has_ended_and_misses_nothing() {
+    let Some(mut rig) = board(true) else { return };
+    for (round, stalled) in [(1, false), (2, true), (3, false)] {
+        begin(&mut rig);
+        rig.run_for(5 * MS + round * MS / 3).unwrap();
+        // A reader that stands still leaves frames in the queue, the endpoint, the batch.
+        rig.with_host(|host, _| host.read(!stalled));
+        rig.run_for(4 * MS).unwrap();
+        rig.with_host(|host, _| host.suspend());
+        let asleep_at = rig.now();
+        rig.run_for(50 * MS).unwrap();
+        for channel in Channel::ALL {
+            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+        }
+        assert_eq!(rig.session_end(), None);
+        rig.with_host(UsbHost::resume);
+        rig.with_host(|host, _| host.read(true));
+        let told = rig.run_while(100 * MS, |rig| rig.session_end().is_none()).unwrap();
+        assert!(told, "round {round}: nobody said that the session has ended");
+        let Some((ticks, EndReason::Suspended)) = rig.session_end() else { panic!() };
+        let ended_at = rig.clock_origin() + ticks * 12;
+        assert!((asleep_at..asleep_at + GRACE).contains(&ended_at), "ended {ended_at}, asleep {asleep_at}");
+        rig.follow_session_end();
+        for channel in Channel::ALL {
+            assert_eq!(rig.ledger.losses(channel).total(), 0, "round {round}");
+        }
+        assert!(rig.ledger.holds(), "round {round}: {:?}", rig.ledger.faults());
+    }
+    assert_eq!(rig.with_host(|host, _| host.counters().enumerations), 1);
 }

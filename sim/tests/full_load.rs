@@ -5,9 +5,9 @@ mod common;
 
 use std::time::Duration;
 
-use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_sim::run::{Load, Options, Report, run};
+use cantap_sim::timing::Bound;
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
@@ -22,44 +22,55 @@ fn capture(options: &Options) -> Option<Report> {
 }
 
 fn at_full_load(kind: Kind, seconds: f64) -> Options {
-    Options { seconds, load: Load::Frames { kind, percent: 100.0 }, ..Options::default() }
+    let load = Load::Frames { kind, percent: 100.0 };
+    Options { seconds, load, bound: common::bound(), ..Options::default() }
 }
 
-/// Both channels at full load lose nothing, and stamps are at most 2 us later than the best.
-fn nothing_is_lost(kind: Kind, seconds: f64, least_frames_per_s: f64) {
-    let Some(report) = capture(&at_full_load(kind, seconds)) else { return };
+/// Both channels at full load lose nothing, and stamps are at most 2 us later than the best; with a core that waits as long
+/// as it can, 3.5.
+fn nothing_is_lost(options: &Options, least_frames_per_s: f64) {
+    let Some(report) = capture(options) else { return };
     assert_eq!(report.channels.len(), 2);
     for channel in &report.channels {
         assert_eq!((channel.delivered, channel.lost.total()), (channel.sent, 0));
         assert!(channel.frames_per_s >= least_frames_per_s, "{channel:?}");
         assert!(channel.bus_load_pct > 99.5, "{channel:?}");
     }
-    assert!(report.stamps.max - report.stamps.min <= 2000, "{:?}", report.stamps);
+    let spread_ns = if report.bound == Bound::Best { 2000 } else { 3500 };
+    assert!(report.stamps.max - report.stamps.min <= spread_ns, "{:?}", report.stamps);
 }
 
 #[test]
 fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
-    nothing_is_lost(Kind::Std0, 2.0, 20_800.0);
+    nothing_is_lost(&at_full_load(Kind::Std0, 2.0), 20_800.0);
+}
+
+/// The same with everything as slow as the manuals allow.
+#[test]
+fn the_shortest_frames_lose_nothing_at_worst() {
+    for (kind, least_frames_per_s) in [(Kind::Std0, 20_800.0), (Kind::Rtr, 21_250.0)] {
+        nothing_is_lost(&Options { bound: Bound::Worst, ..at_full_load(kind, 0.2) }, least_frames_per_s);
+    }
 }
 
 #[test]
 fn remote_frames_of_47_bits_lose_nothing() {
-    nothing_is_lost(Kind::Rtr, 0.3, 21_250.0);
+    nothing_is_lost(&at_full_load(Kind::Rtr, 0.3), 21_250.0);
 }
 
 #[test]
 fn extended_frames_with_eight_bytes_lose_nothing() {
-    nothing_is_lost(Kind::Ext8, 0.5, 6_200.0);
+    nothing_is_lost(&at_full_load(Kind::Ext8, 0.5), 6_200.0);
 }
 
 #[test]
 fn standard_frames_with_eight_bytes_lose_nothing() {
-    nothing_is_lost(Kind::Std8, 0.3, 7_400.0);
+    nothing_is_lost(&at_full_load(Kind::Std8, 0.3), 7_400.0);
 }
 
 #[test]
 fn a_mix_of_everything_loses_nothing() {
-    nothing_is_lost(Kind::Mix, 0.5, 8_000.0);
+    nothing_is_lost(&at_full_load(Kind::Mix, 0.5), 8_000.0);
 }
 
 /// The earlier analyser's table of the load it could carry without loss, 7.7 to 12.8 % over RS-232. Ours: all of it, on
@@ -76,7 +87,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
         (Kind::Ext8, false),
     ] {
         let Some(image) = common::firmware() else { return };
-        let mut rig = Rig::new(image, Setup::default(), Timing::hasty());
+        let mut rig = Rig::new(image, common::setup(), Timing::hasty());
         rig.connect().unwrap();
         let listen = ChannelConfig::listen_only(timing(MEGABIT).unwrap());
         let from = rig.now() + 2 * MS;
@@ -154,6 +165,17 @@ fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {
     let Some(report) = capture(&options) else { return };
     assert!(report.queue_high_water_bytes > 40_000, "{report:?}");
     assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
+}
+
+/// Behind a high-speed hub a packet in every second microframe is 256 kB/s: both channels full of the shortest frames make 215.
+#[test]
+fn a_host_behind_a_high_speed_hub_carries_both_channels() {
+    let mut options = at_full_load(Kind::Std0, 0.3);
+    options.timing = options.timing.behind_hub(2);
+    let Some(report) = capture(&options) else { return };
+    assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
+    // What a host without a hub leaves in the queue is a batch; a queue that only fills would have 25 kB at 130 kB/s.
+    assert!(report.queue_high_water_bytes < 10_000, "{report:?}");
 }
 
 /// The same seed gives the same run, another seed another.

@@ -6,9 +6,9 @@ mod assembly;
 
 use std::sync::{Arc, Mutex};
 
-use assembly::{EQ, NE, Program, adds, ands, bx_lr, cmp, eors, it, ldr, lsls, movs, str, wfi};
+use assembly::{Alarm, EQ, NE, Program, adds, ands, bx_lr, cmp, eors, it, ldr, lsls, movs, str, wfi};
 use cantap_sim::memory_map::SRAM;
-use cantap_sim::{Image, Machine, Peripheral, Setup};
+use cantap_sim::{Image, Machine, Setup};
 
 const DEVICE: u32 = 0x5005_0000;
 const IRQ: u16 = 40;
@@ -17,37 +17,6 @@ const RESULT: u32 = SRAM.start;
 const HANDLED: u32 = SRAM.start + 4;
 const DONE: u32 = SRAM.start + 8;
 const ROUNDS: u32 = 24;
-
-/// Asserts its interrupt from a moment on until it is written to.
-struct Alarm {
-    at: Option<u64>,
-    asserted: bool,
-}
-
-impl Peripheral for Alarm {
-    fn read(&mut self, _offset: u32, _size: u8, _now: u64) -> u32 {
-        0
-    }
-
-    fn write(&mut self, _offset: u32, _size: u8, _value: u32, _now: u64) {
-        self.asserted = false;
-    }
-
-    fn irq(&self) -> bool {
-        self.asserted
-    }
-
-    fn next_event(&self) -> Option<u64> {
-        self.at
-    }
-
-    fn advance(&mut self, now: u64) {
-        if self.at.is_some_and(|at| at <= now) {
-            self.at = None;
-            self.asserted = true;
-        }
-    }
-}
 
 /// A loop of IT blocks of every length and shape, and a handler that itself returns conditionally.
 fn program() -> Image {
@@ -119,7 +88,7 @@ fn expected() -> u32 {
 /// Runs the program with the interrupt at cycle `at`; returns result, interrupts handled and when it was done.
 fn run(at: Option<u64>) -> (u32, u32, u64) {
     let mut machine = Machine::new(program(), Setup::default());
-    let alarm = Arc::new(Mutex::new(Alarm { at, asserted: false }));
+    let alarm = Arc::new(Mutex::new(Alarm::new(at)));
     machine.attach(DEVICE..DEVICE + 0x400, IRQ, alarm);
     let mut done_at = 0;
     while machine.now() < 5000 {

@@ -71,7 +71,7 @@ fn settle(rig: &mut Rig) {
 
 #[test]
 fn one_channel_sends_to_the_other_in_order_and_each_frame_is_confirmed() {
-    let Some(mut rig) = connected(Setup { joined: true, ..Setup::default() }) else { return };
+    let Some(mut rig) = connected(Setup { joined: true, ..common::setup() }) else { return };
     for channel in Channel::ALL {
         rig.open(channel, normal()).unwrap();
     }
@@ -99,7 +99,7 @@ fn one_channel_sends_to_the_other_in_order_and_each_frame_is_confirmed() {
 
 #[test]
 fn sending_while_the_other_channel_is_full_costs_no_frame() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.listen(Can1, MEGABIT).unwrap();
     rig.open(Can2, normal()).unwrap();
     let from = rig.now();
@@ -118,7 +118,7 @@ fn sending_while_the_other_channel_is_full_costs_no_frame() {
 
 #[test]
 fn a_timed_frame_starts_at_its_tick() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, normal()).unwrap();
     rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
     let Reply::Time(ticks) = rig.ask(Command::Time).unwrap() else { panic!("a time") };
@@ -137,7 +137,7 @@ fn a_timed_frame_starts_at_its_tick() {
 
 #[test]
 fn one_shot_frames_report_what_stopped_them() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, ChannelConfig { one_shot: true, ..normal() }).unwrap();
     rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
     rig.machine.board().wires[0].disturb(0, Disturbance::Bit { index: 25 });
@@ -159,7 +159,7 @@ fn one_shot_frames_report_what_stopped_them() {
 #[test]
 fn bus_off_is_reported_and_left_as_configured() {
     for manual_recovery in [false, true] {
-        let Some(mut rig) = connected(Setup::default()) else { return };
+        let Some(mut rig) = connected(common::setup()) else { return };
         rig.open(Can1, ChannelConfig { manual_recovery, ..normal() }).unwrap();
         rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
         for n in 0..32 {
@@ -186,7 +186,7 @@ fn bus_off_is_reported_and_left_as_configured() {
 /// goes out.
 #[test]
 fn a_lone_node_floods_nobody() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, normal()).unwrap();
     let bytes = rig.session.bytes();
     send(&mut rig, Can1, 1, &["123#55"]);
@@ -203,7 +203,7 @@ fn a_lone_node_floods_nobody() {
 
 #[test]
 fn a_stuck_bus_hangs_nothing() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.machine.board().hold_buses_dominant(true);
     for channel in Channel::ALL {
         let response = rig.request(Command::Open { channel, config: Some(normal()) }).unwrap();
@@ -236,7 +236,7 @@ fn a_stuck_bus_hangs_nothing() {
 /// Erasing a flash sector stops the core for a second, which the watchdog must survive and the host too.
 #[test]
 fn defaults_are_saved_and_used_after_a_reset() {
-    let Some(mut rig) = connected(Setup::default()) else { return };
+    let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, normal()).unwrap();
     rig.close(Can1).unwrap();
     let began = rig.now();
@@ -269,7 +269,7 @@ fn defaults_are_saved_and_used_after_a_reset() {
 
 #[test]
 fn the_order_on_the_bus_is_the_order_of_confirmation() {
-    let Some(mut rig) = connected(Setup { joined: true, ..Setup::default() }) else { return };
+    let Some(mut rig) = connected(Setup { joined: true, ..common::setup() }) else { return };
     for channel in Channel::ALL {
         rig.open(channel, normal()).unwrap();
     }

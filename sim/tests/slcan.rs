@@ -4,7 +4,6 @@
 mod common;
 
 use cantap_sim::bus::{BitTime, Node};
-use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::soc::CAN_IRQS;
 use cantap_sim::traffic::{Kind, Script, Traffic};
@@ -15,7 +14,7 @@ const BITRATE_BPS: u32 = 500_000;
 
 /// A board with its port open, and a node that acknowledges on channel 1's bus.
 fn plugged_in() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty());
     rig.plug_in().unwrap();
     rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(BITRATE_BPS)));
     Some(rig)
@@ -258,7 +257,7 @@ print("done")
     fn python_can_sends_and_receives_through_the_elf() {
         let (Some(image), Some(python)) = (common::firmware(), python()) else { return };
         let load = Load::Frames { kind: Kind::Std8, percent: 5.0 };
-        let options = Options { load, ..Options::default() };
+        let options = Options { load, bound: common::bound(), ..Options::default() };
         let manner = Manner { witness: true, ..Manner::default() };
         let mut served = Served::start(image, options, manner).unwrap();
         let witness = served.witness();

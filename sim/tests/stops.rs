@@ -95,7 +95,7 @@ fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
 /// The firmware with one exception's vector bent to `target`, until it ends there.
 fn bend(number: u32, target: impl Fn(&Image) -> u32) -> Option<(Image, Stopped)> {
     let image = common::firmware()?;
-    let mut rig = Rig::new(image.clone(), Setup::default(), Timing::default());
+    let mut rig = Rig::new(image.clone(), common::setup(), Timing::default());
     rig.connect().unwrap();
     let vector = FLASH.start + 4 * number;
     let bent = (target(&image) | 1).to_le_bytes();
@@ -128,7 +128,7 @@ fn a_fault_in_the_firmware_names_the_function_and_its_callers() {
 #[test]
 fn entering_the_rom_bootloader_ends_the_run() {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    let mut rig = Rig::new(image, common::setup(), Timing::default());
     rig.connect().unwrap();
     let (_, bytes) = rig.session.request(Command::Bootloader);
     rig.with_host(|host, _| host.send(&bytes));

@@ -6,6 +6,7 @@ mod common;
 use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::stream::{Replayed, fill, join, replay};
+use cantap_sim::timing::Bound::{self, Best, Worst};
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel::{Can1, Can2};
@@ -16,7 +17,12 @@ const MEGABIT: u32 = 1_000_000;
 
 /// A board that takes part in the buses of `channels`.
 fn joined(channels: &[Channel]) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    joined_under(common::bound(), channels)
+}
+
+/// The same under a bound of time.
+fn joined_under(bound: Bound, channels: &[Channel]) -> Option<Rig> {
+    let mut rig = Rig::new(common::firmware()?, Setup { bound, ..Setup::default() }, Timing::hasty());
     rig.connect().unwrap();
     join(&mut rig, channels).unwrap();
     Some(rig)
@@ -29,22 +35,35 @@ fn saturate(rig: &mut Rig, channel: Channel, ms: u64) {
     rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + ms * MS));
 }
 
-/// Spacing within so much of the plan's, and each confirmation's stamp at most 3.5 us after the frame's end.
-fn hold_times(what: &str, replayed: Option<&[Replayed]>, within_us: f64) {
-    let replayed = replayed.unwrap_or_else(|| panic!("{what}: not all frames in order"));
+/// How late a confirmation's stamp may be: a request's packet is read from USB with interrupts masked.
+fn latest_stamp_us(bound: Bound) -> f64 {
+    if bound == Best { 3.5 } else { 5.0 }
+}
+
+/// Spacing within so much of the plan's, and each confirmation's stamp soon after the frame's end.
+fn hold_times(bound: Bound, what: &str, replayed: Option<&[Replayed]>, within_us: f64) {
+    let replayed = replayed.unwrap_or_else(|| panic!("{bound}, {what}: not all frames in order"));
+    let latest_us = latest_stamp_us(bound);
     for one in replayed {
-        eprintln!("{what}: spacing {:.2} us, stamps {:?}", one.late.width_us(), one.stamps);
-        assert!(one.late.width_us() <= within_us, "{what}: {one:?}");
-        assert!(one.stamps.min_us >= -0.1 && one.stamps.max_us <= 3.5, "{what}: {one:?}");
+        eprintln!("{bound}, {what}: spacing {:.2} us, stamps {:?}", one.late.width_us(), one.stamps);
+        assert!(one.late.width_us() <= within_us, "{bound}, {what}: {one:?}");
+        assert!(one.stamps.min_us >= -0.1 && one.stamps.max_us <= latest_us, "{bound}, {what}: {one:?}");
     }
 }
 
 #[test]
 fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
-    for (load, seconds) in [(10.0, 0.3), (30.0, 0.15), (60.0, 0.15), (90.0, 0.2), (98.0, 0.2)] {
-        let Some(mut rig) = joined(&[Can1]) else { return };
+    for (bound, load, seconds) in [
+        (Best, 10.0, 0.3),
+        (Best, 30.0, 0.15),
+        (Best, 60.0, 0.15),
+        (Best, 90.0, 0.2),
+        (Best, 98.0, 0.2),
+        (Worst, 98.0, 0.1),
+    ] {
+        let Some(mut rig) = joined_under(bound, &[Can1]) else { return };
         let replayed = replay(&mut rig, &[Can1], load, seconds).unwrap();
-        hold_times(&format!("alone at {load} %"), replayed.as_deref(), 0.5);
+        hold_times(bound, &format!("alone at {load} %"), replayed.as_deref(), 0.5);
     }
 }
 
@@ -52,11 +71,12 @@ fn a_replay_keeps_its_spacing_at_any_load_below_saturation() {
 /// a frame.
 #[test]
 fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
-    for load in [30.0, 60.0, 90.0, 98.0] {
-        let Some(mut rig) = joined(&[Can1]) else { return };
+    for (bound, load) in [(Best, 30.0), (Best, 60.0), (Best, 90.0), (Best, 98.0), (Worst, 90.0)] {
+        let Some(mut rig) = joined_under(bound, &[Can1]) else { return };
         saturate(&mut rig, Can2, 280);
         let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
-        hold_times(&format!("beside 100 % at {load} %"), replayed.as_deref(), 1.0);
+        let within_us = if bound == Best { 1.0 } else { 2.0 };
+        hold_times(bound, &format!("beside 100 % at {load} %"), replayed.as_deref(), within_us);
         rig.run_for(100 * MS).unwrap();
         rig.close(Can2).unwrap();
         assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
@@ -64,17 +84,19 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
         assert_eq!(rig.ledger.losses(Can2).total(), 0);
         let stamps = rig.ledger.stamps();
         eprintln!("  the other channel's stamps {stamps:?}");
-        // A request's packet is read from USB with interrupts masked for 3 us.
-        assert!(stamps.max - stamps.min <= 3_200, "{stamps:?}");
+        let spread_ns = if bound == Best { 3_200 } else { 5_000 };
+        assert!(stamps.max - stamps.min <= spread_ns, "{bound}: {stamps:?}");
     }
 }
 
 #[test]
 fn two_replays_at_once_keep_their_spacing() {
-    for (load, seconds) in [(10.0, 0.3), (30.0, 0.15), (60.0, 0.15), (90.0, 0.3)] {
-        let Some(mut rig) = joined(&[Can1, Can2]) else { return };
+    for (bound, load, seconds) in
+        [(Best, 10.0, 0.3), (Best, 30.0, 0.15), (Best, 60.0, 0.15), (Best, 90.0, 0.3), (Worst, 60.0, 0.15)]
+    {
+        let Some(mut rig) = joined_under(bound, &[Can1, Can2]) else { return };
         let replayed = replay(&mut rig, &[Can1, Can2], load, seconds).unwrap();
-        hold_times(&format!("both at {load} %"), replayed.as_deref(), 2.0);
+        hold_times(bound, &format!("both at {load} %"), replayed.as_deref(), 2.0);
     }
 }
 
@@ -85,15 +107,21 @@ fn a_stream_of_eight_byte_frames_fills_the_bus() {
     let filled = fill(&mut rig, &[Can1], Kind::Std8, 2.0).unwrap().expect("all frames in order");
     eprintln!("{filled:?}");
     assert!(filled[0].load_percent >= 99.0 && filled[0].frames > 17_000, "{filled:?}");
-    assert!(filled[0].stamps.min_us >= -0.1 && filled[0].stamps.max_us <= 3.5, "{filled:?}");
+    assert!(
+        filled[0].stamps.min_us >= -0.1 && filled[0].stamps.max_us <= latest_stamp_us(common::bound()),
+        "{filled:?}"
+    );
 }
 
 #[test]
 fn two_streams_at_once_fill_both_buses() {
-    let Some(mut rig) = joined(&[Can1, Can2]) else { return };
-    let filled = fill(&mut rig, &[Can1, Can2], Kind::Std8, 0.2).unwrap().expect("all frames in order");
-    eprintln!("{filled:?}");
-    assert!(filled.iter().all(|one| one.load_percent >= 99.0), "{filled:?}");
+    for (bound, seconds) in [(Best, 0.2), (Worst, 0.1)] {
+        let Some(mut rig) = joined_under(bound, &[Can1, Can2]) else { return };
+        let filled =
+            fill(&mut rig, &[Can1, Can2], Kind::Std8, seconds).unwrap().expect("all frames in order");
+        eprintln!("{bound}: {filled:?}");
+        assert!(filled.iter().all(|one| one.load_percent >= 99.0), "{bound}: {filled:?}");
+    }
 }
 
 /// A full record queue has no room for confirmations. What is due then waits for room; an alarm that came again and again would

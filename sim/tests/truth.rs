@@ -8,6 +8,7 @@ use cantap_sim::capture::{Heard, Session};
 use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::soc::CAN_IRQS;
+use cantap_sim::timing::Bound;
 use cantap_sim::traffic::{Kind, Script, Traffic};
 use cantap_sim::usb_host::Timing;
 use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
@@ -21,7 +22,13 @@ const TICKS_PER_US: f64 = 12.0;
 
 /// A board that listens on both channels, with a session that keeps every byte.
 fn listening() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::default());
+    listening_under(common::bound())
+}
+
+/// The same under a bound of time.
+fn listening_under(bound: Bound) -> Option<Rig> {
+    let setup = Setup { bound, ..Setup::default() };
+    let mut rig = Rig::new(common::firmware()?, setup, Timing::default());
     rig.connect().unwrap();
     rig.record_bytes();
     for channel in BOTH {
@@ -60,22 +67,24 @@ fn frame(text: &str) -> Frame {
 }
 
 /// At 1 Mbit/s receivers take a frame 1 us before its end, so stamps 0 to 2 us after that are within 1 us of the
-/// end of frame.
+/// end of frame, and those to 3.5 us within 2.5.
 #[test]
-fn stamps_are_within_a_microsecond_of_the_end_of_frame_under_full_load() {
-    let Some(mut rig) = listening() else { return };
-    let from = rig.now();
-    for (channel, kind) in [(Channel::Can1, Kind::Std0), (Channel::Can2, Kind::Mix)] {
-        rig.add_traffic(channel, MEGABIT, Traffic::new(kind, 11, 100.0, from, from + 200 * MS));
-    }
-    rig.run_for(210 * MS).unwrap();
-    settle(&mut rig);
-    let stamps = rig.ledger.stamps();
-    println!("{stamps:?}");
-    assert!(stamps.exact > 5000, "{stamps:?}");
-    assert!(stamps.min >= 0 && stamps.max <= 2000, "{stamps:?}");
-    for channel in BOTH {
-        assert_eq!(rig.ledger.losses(channel).total(), 0);
+fn stamps_are_within_a_microsecond_of_the_end_of_frame_under_full_load_and_within_three_at_worst() {
+    for (bound, latest_ns) in [(Bound::Best, 2000), (Bound::Worst, 3500)] {
+        let Some(mut rig) = listening_under(bound) else { return };
+        let from = rig.now();
+        for (channel, kind) in [(Channel::Can1, Kind::Std0), (Channel::Can2, Kind::Mix)] {
+            rig.add_traffic(channel, MEGABIT, Traffic::new(kind, 11, 100.0, from, from + 200 * MS));
+        }
+        rig.run_for(210 * MS).unwrap();
+        settle(&mut rig);
+        let stamps = rig.ledger.stamps();
+        println!("{bound}: {stamps:?}");
+        assert!(stamps.exact > 5000, "{stamps:?}");
+        assert!(stamps.min >= 0 && stamps.max <= latest_ns, "{bound}: {stamps:?}");
+        for channel in BOTH {
+            assert_eq!(rig.ledger.losses(channel).total(), 0);
+        }
     }
 }
 
@@ -213,7 +222,7 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
 #[test]
 fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    let mut rig = Rig::new(image, common::setup(), Timing::default());
     rig.connect().unwrap();
     for (channel, wrong) in [(Channel::Can1, 500_000), (Channel::Can2, 800_000)] {
         rig.listen(channel, wrong).unwrap();
@@ -309,7 +318,8 @@ fn a_trace_file_shows_interrupts_frames_masking_and_sleep() {
     let on_bus = rig.ledger.on_bus_count(Channel::Can1) as usize;
     assert!(on_bus > 20);
     assert_eq!(count("CAN1_RX0"), on_bus, "one interrupt for each frame");
-    assert!(count("interrupts masked") > 0 && count("asleep") > 0 && count("OTG_FS") > 0);
+    assert!(count("asleep") > 0 && count("OTG_FS") > 0);
+    assert_eq!(count("interrupts masked"), 0, "nothing keeps the capture interrupt waiting");
     let frames = events.iter().filter(|event| event["args"]["sender"] == "node 0").count();
     assert_eq!(frames, on_bus);
     assert!(events.iter().any(|event| event["ph"] == "C" && event["args"]["frames"] == 1));

@@ -4,14 +4,18 @@ mod common;
 
 use cantap_sim::machine::Setup;
 use cantap_sim::rig::Rig;
+use cantap_sim::timing::Bound;
 use cantap_sim::usb_host::Timing;
 
 #[test]
 fn the_device_enumerates_as_a_serial_port_and_says_hello() {
-    let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, Setup::default(), Timing::default());
-    let hello = rig.connect().unwrap();
-    println!("{hello:?} at {} us", rig.now() / 144);
-    let identity = rig.with_host(|host, _| host.identity().cloned()).unwrap();
-    println!("{identity:?}");
+    for bound in Bound::ALL {
+        let Some(image) = common::firmware() else { return };
+        let mut rig = Rig::new(image, Setup { bound, ..Setup::default() }, Timing::default());
+        let hello = rig.connect().unwrap();
+        println!("{bound}: {hello:?} at {} us", rig.now() / 144);
+        let identity = rig.with_host(|host, _| host.identity().cloned()).unwrap();
+        println!("{identity:?}");
+        assert_eq!(rig.machine.board().odd_accesses(), []);
+    }
 }

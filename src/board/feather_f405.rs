@@ -8,12 +8,13 @@
 //! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: CAN2 has PB5 or PB12 for RX, PB6 or PB13 for TX, all as AF9. Neither RX
 //!   pin is on the headers; PB12 goes to the card socket's detect switch, which is open without a card (MicroPython
 //!   reads it with a pull-up, low for a card).
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which no bus is on here, and TX on PB13, which is
+//!   channel 2's.
 
-use stm32f4xx_hal::gpio::{GpioExt, PinState};
-use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::gpio::{GpioExt, PC1, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Connected, Led, Leds, Ports, UsbRegisters};
+use super::{Led, Leds, Ports, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "feather-f405";
@@ -21,20 +22,28 @@ pub const NAME: &str = "feather-f405";
 pub const HSE_MHZ: u32 = 12;
 
 /// Connects pins and peripherals.
-pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
+pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     let a = ports.a.split(rcc);
     let b = ports.b.split(rcc);
     let c = ports.c.split(rcc);
 
+    a.pa11.into_alternate::<10>();
+    a.pa12.into_alternate::<10>();
     // The pull-ups make an input without a transceiver read recessive.
     b.pb8.into_alternate::<9>().internal_pull_up(true);
-    b.pb9.into_alternate::<9>();
+    fast(b.pb9.into_alternate::<9>());
     b.pb12.into_alternate::<9>().internal_pull_up(true);
-    b.pb13.into_alternate::<9>();
+    fast(b.pb13.into_alternate::<9>());
 
-    let led = c.pc1.into_push_pull_output_in_state(PinState::Low);
-    Connected {
-        usb: USB::new(usb, (a.pa11, a.pa12), &rcc.clocks),
-        leds: Leds::One(Led::new(led.erase(), PinState::High)),
-    }
+    led(c.pc1)
+}
+
+/// Connects the LED, and nothing else.
+pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
+    led(ports.c.split(rcc).pc1)
+}
+
+fn led(pc1: PC1) -> Leds {
+    let led = pc1.into_push_pull_output_in_state(PinState::Low);
+    Leds::One(Led::new(led.erase(), PinState::High))
 }

@@ -9,17 +9,16 @@ mod olimex_p405;
 mod stm32f4_discovery;
 
 #[cfg(feature = "feather-f405")]
-pub use feather_f405::{HSE_MHZ, NAME, connect};
+pub use feather_f405::{HSE_MHZ, NAME, connect, leds};
 #[cfg(feature = "olimex-p405")]
-pub use olimex_p405::{HSE_MHZ, NAME, connect};
+pub use olimex_p405::{HSE_MHZ, NAME, connect, leds};
 #[cfg(feature = "stm32f4-discovery")]
-pub use stm32f4_discovery::{HSE_MHZ, NAME, connect};
+pub use stm32f4_discovery::{HSE_MHZ, NAME, connect, leds};
 
 #[cfg(not(any(feature = "olimex-p405", feature = "feather-f405", feature = "stm32f4-discovery")))]
 compile_error!("choose a board: --features olimex-p405, feather-f405 or stm32f4-discovery");
 
-use stm32f4xx_hal::gpio::{AnyPin, Output, PinState};
-use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::gpio::{AnyPin, Output, PinSpeed, PinState, Speed};
 use stm32f4xx_hal::pac;
 
 /// The chip's ports that boards use.
@@ -35,15 +34,10 @@ pub struct Ports {
     pub d: pac::GPIOD,
 }
 
-/// The USB peripheral, to be connected to its pins.
-pub type UsbRegisters = (pac::OTG_FS_GLOBAL, pac::OTG_FS_DEVICE, pac::OTG_FS_PWRCLK);
-
-/// What a board's file makes of the pins. The CAN pins need nothing more once they are connected.
-pub struct Connected {
-    /// USB on its pins.
-    pub usb: USB,
-    /// The LEDs.
-    pub leds: Leds,
+/// A CAN controller's TX pin, whose edges are to take next to nothing of the shortest bit, 1 µs: at the lowest speed, which is the
+/// reset's, an edge may take 100 ns (STM32F405 data sheet, "I/O AC characteristics"), differently long up and down.
+fn fast<P: PinSpeed>(pin: P) -> P {
+    pin.speed(Speed::High)
 }
 
 /// An LED and the level that lights it.

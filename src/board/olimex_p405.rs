@@ -5,17 +5,19 @@
 //!   PB8/PB9, LED on PC12, the pins of the GPIO row and of UEXT.
 //! - The printed circuit is the STM32-P103's, as the name of Olimex's schematic, `STM32-P103_P405_sch.pdf`, says.
 //!   ChibiOS `os/hal/boards/OLIMEX_STM32_P103/board.h`: PC10 is the transceiver's mode pin, PC11 low connects a
-//!   pull-up to the USB line, PB12 to PB15 go to the card socket.
+//!   pull-up to the USB line, PB12 to PB15 go to the card socket. Zephyr's `doc/index.rst` has PB12 in the GPIO row, too; on a
+//!   card it is the select line, an input, so that a card in the socket does not disturb it.
 //! - Feaser LibMicroBLT `demos/ARMCM4_STM32F4_Olimex_STM32P405_CubeIDE/App/led.c`: PC12 low lights the LED. (Zephyr
 //!   and RIOT say high; this demonstration was made for the board and the P103's LED is lit by low, too.)
-//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PB8/PB9 and CAN2 on PB5/PB6, AF10 is OTG_FS on PA11/PA12.
+//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PB8/PB9 and CAN2 on PB12/PB6, AF10 is OTG_FS on PA11/PA12.
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader listens on CAN2's other pins, PB5 and PB13. Neither is channel 2's here, so
+//!   that a bus with traffic does not take the bootloader from USB.
 //! - SN65HVD230 data sheet (SLOS346), "RS": low selects the high-speed mode.
 
-use stm32f4xx_hal::gpio::{GpioExt, PinState};
-use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::gpio::{GpioExt, PC12, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Connected, Led, Leds, Ports, UsbRegisters};
+use super::{Led, Leds, Ports, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "olimex-p405";
@@ -23,24 +25,32 @@ pub const NAME: &str = "olimex-p405";
 pub const HSE_MHZ: u32 = 8;
 
 /// Connects pins and peripherals.
-pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
+pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     let a = ports.a.split(rcc);
     let b = ports.b.split(rcc);
     let c = ports.c.split(rcc);
 
+    a.pa11.into_alternate::<10>();
+    a.pa12.into_alternate::<10>();
     // The pull-ups make an input without a transceiver read recessive.
     b.pb8.into_alternate::<9>().internal_pull_up(true);
-    b.pb9.into_alternate::<9>();
-    b.pb5.into_alternate::<9>().internal_pull_up(true);
-    b.pb6.into_alternate::<9>();
+    fast(b.pb9.into_alternate::<9>());
+    b.pb12.into_alternate::<9>().internal_pull_up(true);
+    fast(b.pb6.into_alternate::<9>());
     // The transceiver's high-speed mode; high would be standby.
     c.pc10.into_push_pull_output_in_state(PinState::Low);
     // The chip pulls the USB line up by itself.
     c.pc11.into_push_pull_output_in_state(PinState::High);
 
-    let led = c.pc12.into_push_pull_output_in_state(PinState::High);
-    Connected {
-        usb: USB::new(usb, (a.pa11, a.pa12), &rcc.clocks),
-        leds: Leds::One(Led::new(led.erase(), PinState::Low)),
-    }
+    led(c.pc12)
+}
+
+/// Connects the LED, and nothing else.
+pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
+    led(ports.c.split(rcc).pc12)
+}
+
+fn led(pc12: PC12) -> Leds {
+    let led = pc12.into_push_pull_output_in_state(PinState::High);
+    Leds::One(Led::new(led.erase(), PinState::Low))
 }

@@ -2,17 +2,20 @@
 //!
 //! Sources:
 //! - Zephyr 4.3 `boards/st/stm32f4_disco/stm32f4_disco.dts`: crystal 8 MHz; LEDs on PD12 (green), PD13 (orange), PD14
-//!   (red), PD15 (blue), lit by high; USB on PA11/PA12; CAN2 on PB5/PB13; PB6/PB9 belong to the audio codec, so CAN1
+//!   (red), PD15 (blue), lit by high; USB on PA11/PA12; CAN2's TX on PB13; PB6/PB9 belong to the audio codec, so CAN1
 //!   is not on PB8/PB9.
+//! - NuttX `boards/arm/stm32/stm32f4discovery/README.txt`, "UART/USART PINS", which has it from the board's user guide: PB12 and
+//!   PB13 have no function on the board.
+//! - AN2606, "STM32F40xxx/41xxx": the ROM bootloader has CAN2's RX on PB5, which no bus is on here, and TX on PB13, which is
+//!   channel 2's.
 //! - NuttX `boards/arm/stm32/stm32f4discovery/src/stm32f4discovery.h`: PC0 switches 5 V to the USB connector on, for
 //!   when the board is the host; ST's generated code for the board sets it high, which is off.
-//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PD0/PD1 and CAN2 on PB5/PB13.
+//! - stm32f4xx-hal 0.23 `src/gpio/alt/f4.rs`: AF9 is CAN1 on PD0/PD1 and CAN2 on PB12/PB13.
 
-use stm32f4xx_hal::gpio::{GpioExt, PinState};
-use stm32f4xx_hal::otg_fs::USB;
+use stm32f4xx_hal::gpio::{GpioExt, PD12, PD13, PD14, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Connected, Led, Leds, Ports, UsbRegisters};
+use super::{Led, Leds, Ports, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "stm32f4-discovery";
@@ -20,29 +23,38 @@ pub const NAME: &str = "stm32f4-discovery";
 pub const HSE_MHZ: u32 = 8;
 
 /// Connects pins and peripherals.
-pub fn connect(ports: Ports, usb: UsbRegisters, rcc: &mut Rcc) -> Connected {
+pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {
     let a = ports.a.split(rcc);
     let b = ports.b.split(rcc);
     let c = ports.c.split(rcc);
     let d = ports.d.split(rcc);
 
+    a.pa11.into_alternate::<10>();
+    a.pa12.into_alternate::<10>();
     // The pull-ups make an input without a transceiver read recessive.
     d.pd0.into_alternate::<9>().internal_pull_up(true);
-    d.pd1.into_alternate::<9>();
-    b.pb5.into_alternate::<9>().internal_pull_up(true);
-    b.pb13.into_alternate::<9>();
+    fast(d.pd1.into_alternate::<9>());
+    b.pb12.into_alternate::<9>().internal_pull_up(true);
+    fast(b.pb13.into_alternate::<9>());
     // The host feeds the board, not the board the host.
     c.pc0.into_push_pull_output_in_state(PinState::High);
 
-    let power = d.pd12.into_push_pull_output_in_state(PinState::Low);
-    let traffic = d.pd13.into_push_pull_output_in_state(PinState::Low);
-    let error = d.pd14.into_push_pull_output_in_state(PinState::Low);
-    Connected {
-        usb: USB::new(usb, (a.pa11, a.pa12), &rcc.clocks),
-        leds: Leds::Three {
-            power: Led::new(power.erase(), PinState::High),
-            traffic: Led::new(traffic.erase(), PinState::High),
-            error: Led::new(error.erase(), PinState::High),
-        },
+    three(d.pd12, d.pd13, d.pd14)
+}
+
+/// Connects the LEDs, and nothing else.
+pub fn leds(ports: Ports, rcc: &mut Rcc) -> Leds {
+    let d = ports.d.split(rcc);
+    three(d.pd12, d.pd13, d.pd14)
+}
+
+fn three(pd12: PD12, pd13: PD13, pd14: PD14) -> Leds {
+    let power = pd12.into_push_pull_output_in_state(PinState::Low);
+    let traffic = pd13.into_push_pull_output_in_state(PinState::Low);
+    let error = pd14.into_push_pull_output_in_state(PinState::Low);
+    Leds::Three {
+        power: Led::new(power.erase(), PinState::High),
+        traffic: Led::new(traffic.erase(), PinState::High),
+        error: Led::new(error.erase(), PinState::High),
     }
 }

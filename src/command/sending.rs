@@ -5,8 +5,9 @@ use cantap_wire::{Channel, Refusal, Reply};
 use heapless::Vec;
 
 use crate::TICK_HZ;
+use crate::periodic::{self, PERIODIC_SLOTS};
 use crate::ports::Board;
-use crate::transmit::{self, PERIODIC_SLOTS, TRIGGER_SLOTS};
+use crate::transmit::TRIGGER_SLOTS;
 
 /// Target times may be so far ahead: a day.
 const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;
@@ -57,7 +58,7 @@ pub(super) fn set_periodic<'q, const N: usize>(
     }
     if let Some(entry) = &entry {
         can_send(channel, board)?;
-        if !transmit::is_valid(entry) {
+        if !periodic::is_valid(entry) {
             return Err(Refusal::BadEntry);
         }
     }

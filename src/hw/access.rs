@@ -1,16 +1,19 @@
-//! Joins the session, at low priority, to what the capture interrupts own: [`Board`] over the board.
+//! Joins the session, at priority 2, to what the tasks of priority 4 own: [`Board`] over the board.
 
 use cantap_firmware::QUEUE_BYTES;
 use cantap_firmware::capture::Capture;
 use cantap_firmware::ports::{Board, Clock};
+use cantap_firmware::sof::SofReading;
 use cantap_wire::{CHANNELS, Channel};
 use rtic::Mutex;
 
 use super::can::{CanControl, CanFilters, CanTraffic};
 use super::chip::BoardChip;
+use super::crc::CrcUnit;
+use super::sof::SofLatch;
 use super::stamp::StampTimer;
 
-/// What the highest-priority interrupts own.
+/// What the tasks of priority 4 own.
 pub struct Tap {
     /// The logic.
     pub capture: Capture<'static>,
@@ -30,6 +33,10 @@ pub struct Controls {
     pub chip: BoardChip,
     /// The stamp timer, to be read.
     pub stamp: StampTimer,
+    /// Its latch of USB's start of frame.
+    pub sof: SofLatch,
+    /// The CRC unit.
+    pub crc: CrcUnit,
 }
 
 /// Commands' own, and the way to the rest.
@@ -56,6 +63,14 @@ impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
 
     fn now(&self) -> u32 {
         self.controls.stamp.now()
+    }
+
+    fn take_sof(&mut self) -> Option<SofReading> {
+        self.controls.sof.take()
+    }
+
+    fn crc32(&mut self, message: &[u8]) -> u32 {
+        self.controls.crc.crc32(message)
     }
 
     fn control(&mut self, channel: Channel) -> &mut CanControl {

@@ -50,7 +50,7 @@ impl Controllers {
         CAN1::reset(rcc);
         CAN2::reset(rcc);
         let blocks = [Registers(CAN1::ptr()), Registers(CAN2::ptr())];
-        let mut control = blocks.map(|can| CanControl { can });
+        let mut control = blocks.map(|can| CanControl { can, halt: Halt::None });
         // After a reset a controller sleeps.
         control.iter_mut().for_each(Control::stop);
         Self {
@@ -347,20 +347,50 @@ fn received_id(rir: &rir::R) -> Id {
     }
 }
 
+/// How far [`Control::halt`] has come.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Halt {
+    None,
+    /// The reset is written; the controller acknowledges it by sleeping.
+    Resetting,
+    /// It sleeps no more, and is asked for initialisation mode.
+    Entering,
+}
+
 /// A controller's control half. It alone writes MCR and BTR, and IER while the controller is off the bus.
 pub struct CanControl {
     can: Registers,
+    halt: Halt,
+}
+
+impl CanControl {
+    /// Sleep is left and initialisation mode entered by one write: without INRQ a controller would first wait for eleven recessive
+    /// bits, which a stuck bus does not have (Zephyr, issue 71142).
+    fn ask_for_initialisation(&self) {
+        self.can.mcr().modify(|_, w| w.sleep().clear_bit().inrq().set_bit());
+    }
 }
 
 impl Control for CanControl {
     fn stop(&mut self) {
-        self.can.mcr().modify(|_, w| w.sleep().clear_bit().inrq().set_bit());
+        self.halt = Halt::None;
+        self.ask_for_initialisation();
     }
 
+    /// The controller's own reset, once: another, or any write of MCR before SLAK has acknowledged the first, would begin it anew or
+    /// be lost. As Linux's `bxcan_chip_softreset`, but without waiting.
     fn halt(&mut self) {
-        // The controller's own reset: it sleeps then, and leaves the other one and the filters alone.
-        self.can.mcr().modify(|_, w| w.reset().set_bit());
-        self.stop();
+        match self.halt {
+            Halt::None => {
+                self.can.mcr().modify(|_, w| w.reset().set_bit());
+                self.halt = Halt::Resetting;
+            }
+            Halt::Resetting if self.can.msr().read().slak().bit() => {
+                self.ask_for_initialisation();
+                self.halt = Halt::Entering;
+            }
+            Halt::Resetting | Halt::Entering => {}
+        }
     }
 
     fn is_stopped(&self) -> bool {
@@ -425,7 +455,9 @@ impl FilterBanks for CanFilters {
         let active = bits(|_| true);
 
         // In initialisation mode neither controller receives, so it is entered only if it must be.
-        let reshaped = can.fmr().read().can2sb().bits() != layout.split
+        // It is in that mode after a reset, too.
+        let reshaped = can.fmr().read().finit().bit()
+            || can.fmr().read().can2sb().bits() != layout.split
             || can.fm1r().read().bits() != lists
             || can.fs1r().read().bits() != wide
             || can.fa1r().read().bits() != active;

@@ -5,11 +5,12 @@ use core::fmt::Write;
 use cantap_firmware::lights::{Activity, Lights};
 use cantap_firmware::ports::Chip;
 use cantap_firmware::saved;
+use cantap_wire::message::Failures;
 use heapless::String;
 
 use super::flash::LastSector;
-use super::restart;
 use super::sensors::Sensors;
+use super::{failure, restart};
 use crate::board::Leds;
 
 /// The 96-bit unique ID (RM0090, "Unique device ID register").
@@ -55,6 +56,10 @@ impl Chip for BoardChip {
 
     fn supply_millivolts(&mut self) -> Option<u16> {
         self.sensors.supply_millivolts()
+    }
+
+    fn failures(&mut self) -> Failures {
+        failure::failures()
     }
 
     fn identify(&mut self, seconds: u8) {

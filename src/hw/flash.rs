@@ -3,6 +3,9 @@
 //!
 //! Erasing and programming stop every instruction fetch from flash: 16 µs for a word, which the receive FIFOs
 //! bear, up to 2 s for the sector, which they do not (STM32F405 data sheet, "Flash memory programming").
+//!
+//! An error's flag stays until it is cleared, and while one is set the interface takes nothing: users of the chip report it,
+//! and ST's drivers clear the flags before each operation. So does this one, whoever left them.
 
 use cantap_firmware::saved::Sector;
 use stm32f4xx_hal::pac::FLASH;
@@ -14,6 +17,33 @@ const WORDS: usize = 128 * 1024 / 4;
 /// RM0090, "Unlocking the Flash control register".
 const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 
+/// Locks the control register, which another program may have left open, and clears what errors it left.
+pub fn lock(flash: &FLASH) {
+    wait(flash);
+    clear_flags(flash);
+    flash.cr().write(|w| w.lock().set_bit());
+}
+
+fn wait(flash: &FLASH) {
+    while flash.sr().read().bsy().bit() {}
+}
+
+fn clear_flags(flash: &FLASH) {
+    flash.sr().write(|w| {
+        w.eop().clear().operr().clear().wrperr().clear().pgaerr().clear().pgperr().clear().pgserr().clear()
+    });
+}
+
+/// Whether the last operation told of no error.
+fn went_well(flash: &FLASH) -> bool {
+    let sr = flash.sr().read();
+    !(sr.operr().is_active()
+        || sr.wrperr().is_active()
+        || sr.pgaerr().is_active()
+        || sr.pgperr().is_active()
+        || sr.pgserr().is_active())
+}
+
 /// The sector.
 pub struct LastSector(FLASH);
 
@@ -23,19 +53,26 @@ impl LastSector {
         Self(flash)
     }
 
-    /// Unlocks the flash, does something, waits for its end, locks the flash.
-    fn unlocked(&mut self, act: impl FnOnce(&FLASH)) {
+    /// Unlocks the flash, does something, waits for its end, locks the flash. Returns whether it went well.
+    fn unlocked(&mut self, act: impl FnOnce(&FLASH)) -> bool {
+        wait(&self.0);
+        // Keys that are not wanted lock the register until the next reset. It is locked: `lock` at the start, and here below.
         for key in KEYS {
             // SAFETY: the two keys, in their order.
             self.0.keyr().write(|w| unsafe { w.bits(key) });
         }
+        clear_flags(&self.0);
         act(&self.0);
-        while self.0.sr().read().bsy().bit() {}
+        // A store may still be on its way, and the flash not busy yet.
+        cortex_m::asm::dsb();
+        wait(&self.0);
+        let went_well = went_well(&self.0);
         self.0.cr().modify(|_, w| w.pg().clear_bit().ser().clear_bit().lock().set_bit());
         // What was read before is not there any more.
         self.0.acr().modify(|_, w| w.dcen().clear_bit());
         self.0.acr().modify(|_, w| w.dcrst().set_bit());
         self.0.acr().modify(|_, w| w.dcrst().clear_bit().dcen().set_bit());
+        went_well
     }
 }
 
@@ -50,22 +87,22 @@ impl Sector for LastSector {
         if index >= WORDS {
             return false;
         }
-        self.unlocked(|flash| {
+        let went_well = self.unlocked(|flash| {
             flash.cr().modify(|_, w| w.psize().psize32().pg().set_bit());
             // SAFETY: inside the sector, which nobody holds a reference to, because `self` is exclusive.
             unsafe { START.cast_mut().add(index).write_volatile(word) };
         });
         // SAFETY: as above. Volatile, because the compiler does not see that the memory changed.
-        unsafe { START.add(index).read_volatile() == word }
+        went_well && unsafe { START.add(index).read_volatile() == word }
     }
 
     fn erase(&mut self) -> bool {
-        self.unlocked(|flash| {
+        let went_well = self.unlocked(|flash| {
             // SAFETY: the chip has this sector.
             flash.cr().modify(|_, w| unsafe { w.psize().psize32().ser().set_bit().snb().bits(SECTOR) });
             flash.cr().modify(|_, w| w.strt().set_bit());
         });
         // SAFETY: the first word of the sector; volatile, because the compiler does not see that it changed.
-        unsafe { START.read_volatile() == cantap_firmware::saved::ERASED }
+        went_well && unsafe { START.read_volatile() == cantap_firmware::saved::ERASED }
     }
 }

@@ -4,22 +4,26 @@
 pub mod access;
 pub mod can;
 pub mod chip;
+mod clocks;
+pub mod crc;
+mod entry;
+mod failure;
 mod flash;
 mod leds;
 mod restart;
 mod sensors;
+pub mod sof;
 pub mod stamp;
 pub mod tick;
 pub mod usb;
 pub mod watchdog;
 
-use cantap_firmware::CAN_CLOCK_HZ;
 use cantap_firmware::command::Identity;
+use cantap_firmware::lights;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
-use stm32f4xx_hal::rcc::{Config, Rcc};
 
-use crate::board::{self, Ports};
+use crate::board::{self, Leds, Ports};
 
 /// The protocol's version, for those who load the ELF ([`cantap_wire::PROTOCOL_SYMBOL`]).
 // SAFETY: no other symbol has this name. `used`, because nothing in the firmware reads it.
@@ -33,8 +37,12 @@ pub struct Hardware {
     pub can: can::Controllers,
     /// The stamp timer.
     pub stamp: stamp::StampTimer,
+    /// Its latch of USB's start of frame.
+    pub sof: sof::SofLatch,
     /// The millisecond tick.
     pub tick: tick::Tick,
+    /// The CRC unit.
+    pub crc: crc::CrcUnit,
     /// The virtual COM port.
     pub usb: usb::UsbPort,
     /// The chip.
@@ -47,38 +55,60 @@ pub struct Hardware {
     pub restarted_after_failure: bool,
 }
 
+/// So long USB stays disconnected at a start that finds it connected, in ms. 2.5 µs are enough for a hub to see it (USB 2.0
+/// §7.1.7.3); what a host's software makes of a device that is back at once is another matter.
+const DISCONNECTED_MS: u32 = 10;
+
 /// Sets the board up. To be called once, first of all.
 pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> Hardware {
     let restarted_after_failure = restart::begin(&device.RCC, &device.SYSCFG);
-    let watchdog = watchdog::Watchdog::start(device.IWDG, &device.DBGMCU);
-    let mut rcc = clocks(device.RCC);
+    let found = entry::restore(&device.RCC, &device.SYSCFG, &device.FLASH);
+    restart::forget_reset_cause(&device.RCC);
+    let mut watchdog = watchdog::Watchdog::start(device.IWDG, &device.DBGMCU);
     let ports = Ports { a: device.GPIOA, b: device.GPIOB, c: device.GPIOC, d: device.GPIOD };
+    let mut rcc = device.RCC.constrain();
+    if !clocks::start_crystal(&rcc) {
+        show_no_crystal(&mut board::leds(ports, &mut rcc), &mut watchdog);
+    }
+    let mut rcc = clocks::run(rcc);
+    if found.usb_was_connected {
+        clocks::wait_ms(DISCONNECTED_MS, clocks::SYSCLK_HZ);
+    }
+    let leds = board::connect(ports, &mut rcc);
     let usb = (device.OTG_FS_GLOBAL, device.OTG_FS_DEVICE, device.OTG_FS_PWRCLK);
-    let connected = board::connect(ports, usb, &mut rcc);
     let serial = chip::serial_number();
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
+    stay_in_reach_of_a_debugger(&device.DBGMCU);
+    let stamp = stamp::StampTimer::start(device.TIM2, &mut rcc);
     Hardware {
         can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc),
-        stamp: stamp::StampTimer::start(device.TIM2, &mut rcc),
+        stamp,
+        sof: sof::SofLatch::start(stamp),
         tick: tick::Tick::start(device.TIM7, &mut rcc),
-        usb: usb::UsbPort::new(connected.usb, &serial, usb_memory),
-        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), connected.leds),
+        crc: crc::CrcUnit::start(device.CRC, &mut rcc),
+        usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),
+        chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), leds),
         watchdog,
         identity: Identity { board: board::NAME, serial },
         restarted_after_failure,
     }
 }
 
-/// 144 MHz for the processor, a quarter of it for CAN, 48 MHz for USB: from a crystal of 8 or 12 MHz by a PLL at
-/// 288 MHz, divided by 2 and by 6.
-fn clocks(rcc: pac::RCC) -> Rcc {
-    let config = Config::hse(board::HSE_MHZ.MHz())
-        .sysclk(144.MHz())
-        .pclk1(CAN_CLOCK_HZ.Hz())
-        .pclk2(72.MHz())
-        .require_pll48clk();
-    let rcc = rcc.freeze(config);
-    // Wrong clocks would give wrong bit rates. Holds for every board above, whatever the HAL's search finds first.
-    assert!(rcc.clocks.pclk1().raw() == CAN_CLOCK_HZ && rcc.clocks.is_pll48clk_valid(), "clocks");
-    rcc
+/// Says by the LED, from HSI, that the crystal does not start, for a period of the pattern; then starts again, which is the next
+/// try. So a board without a crystal blinks for ever, and one whose crystal comes up late comes up late.
+fn show_no_crystal(leds: &mut Leds, watchdog: &mut watchdog::Watchdog) -> ! {
+    failure::record(format_args!("the {} MHz crystal did not start", board::HSE_MHZ));
+    for at_ms in 0..lights::NO_CLOCK_MS {
+        leds.show(lights::no_clock(at_ms));
+        watchdog.feed();
+        clocks::wait_ms(1, clocks::HSI_HZ);
+    }
+    restart::after_failure()
+}
+
+/// Keeps the processor's clock on for a debugger while the processor sleeps (RM0090, DBGMCU_CR, DBG_SLEEP). It costs some of
+/// the current that sleep saves. Chips of ST's were seen to execute nonsense when they wake from WFI like this, with interrupts
+/// disabled: so nothing here sleeps with interrupts disabled, and `idle` has a barrier behind its WFI.
+fn stay_in_reach_of_a_debugger(debug: &pac::DBGMCU) {
+    debug.cr().modify(|_, w| w.dbg_sleep().set_bit());
 }

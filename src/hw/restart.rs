@@ -1,14 +1,14 @@
-//! How one run of the firmware ends and what the next one learns of it.
+//! How one run of the firmware ends and what the next one does about it.
 //!
 //! A word of RAM that startup does not touch outlives every reset but a loss of power.
 
 use core::mem::MaybeUninit;
-use core::panic::PanicInfo;
 use core::ptr::{addr_of, addr_of_mut};
 
 use cortex_m::peripheral::{NVIC, SCB};
-use cortex_m_rt::{ExceptionFrame, exception};
 use stm32f4xx_hal::pac;
+
+use super::{entry, failure};
 
 /// What the next run shall know. Arbitrary numbers that RAM is unlikely to hold by chance.
 const ENTER_BOOTLOADER: u32 = 0xB007_10AD;
@@ -40,44 +40,45 @@ pub fn restart() -> ! {
     SCB::sys_reset()
 }
 
+/// Restarts the firmware, which has failed and said why.
+pub fn after_failure() -> ! {
+    leave(FAILED);
+    SCB::sys_reset()
+}
+
 /// Restarts into the chip's ROM bootloader.
 pub fn restart_into_bootloader() -> ! {
     leave(ENTER_BOOTLOADER);
     SCB::sys_reset()
 }
 
-/// The first thing a run does, before any clock or peripheral is set up: enters the bootloader if the last run asked for
-/// it. Returns whether the last run failed: a panic, a fault, or the watchdog.
+/// The first thing a run does: enters the bootloader if the last run asked for it, with the chip as the reset left it. Returns
+/// whether the last run failed: a panic, a fault, a clock, or the watchdog.
 pub fn begin(rcc: &pac::RCC, syscfg: &pac::SYSCFG) -> bool {
     let message = take();
     if message == ENTER_BOOTLOADER {
-        rcc.apb2enr().modify(|_, w| w.syscfgen().enabled());
+        entry::enable_syscfg(rcc);
         // SAFETY: the field has two bits, and this is one of its values.
         syscfg.memrmp().modify(|_, w| unsafe { w.mem_mode().bits(MAP_SYSTEM_MEMORY) });
-        // SAFETY: with the tasks' interrupts off again, nothing but the clock gate above differs from the state after a
-        // reset, which is what the bootloader expects; it needs interrupts as such, which startup has masked.
+        cortex_m::asm::dsb();
+        // SAFETY: with the tasks' interrupts off again and the vector table at 0, nothing but the clock gate above differs from
+        // the state after a reset, which is what the bootloader expects; it needs interrupts as such, which startup has masked.
         unsafe {
             (*NVIC::PTR).icer.iter().for_each(|disable| disable.write(u32::MAX));
+            entry::forget_vectors();
             cortex_m::interrupt::enable();
             cortex_m::asm::bootload(SYSTEM_MEMORY);
         }
     }
     let bitten = rcc.csr().read().wdgrstf().is_reset();
+    let failed = message == FAILED;
+    if bitten && !failed {
+        failure::record(format_args!("watchdog: the millisecond tick stood still for four seconds"));
+    }
+    failed || bitten
+}
+
+/// Forgets why the chip was last reset, so that the next start finds its own reason.
+pub fn forget_reset_cause(rcc: &pac::RCC) {
     rcc.csr().modify(|_, w| w.rmvf().clear());
-    message == FAILED || bitten
-}
-
-/// Leaves word and restarts: a device that restarts is there again in a second, one that stands still never.
-#[panic_handler]
-fn panic(_: &PanicInfo) -> ! {
-    leave(FAILED);
-    SCB::sys_reset()
-}
-
-/// As a panic.
-// SAFETY: touches a word of RAM that nobody refers to, and a register, then resets.
-#[exception]
-unsafe fn HardFault(_: &ExceptionFrame) -> ! {
-    leave(FAILED);
-    SCB::sys_reset()
 }

@@ -1,4 +1,4 @@
-//! The stamp timer: TIM2, 32 bits, free running at 12 MHz, with one compare channel as the alarm.
+//! The stamp timer: TIM2, 32 bits, free running at 12 MHz, with one compare channel as the alarm. Another is `sof.rs`'s.
 
 use core::ops::Deref;
 
@@ -52,9 +52,9 @@ impl StampTimer {
 }
 
 impl Clock for StampTimer {
-    /// 10 µs: longer than the other handlers of the alarm's priority take for a frame, and any lock. Stamps are taken at a higher
-    /// priority and do not wait; draining the FIFOs has 141 µs.
-    const ALARM_EARLY_TICKS: u32 = 10 * TICKS_PER_US;
+    /// 14 µs: longer than the other handlers of the alarm's priority take for a frame, those that drain before it, and any lock.
+    /// Stamps are taken at a higher priority and do not wait; draining the FIFOs has 141 µs.
+    const ALARM_EARLY_TICKS: u32 = 14 * TICKS_PER_US;
 
     #[inline]
     fn wait_until(&self, at: u32) {

@@ -86,6 +86,7 @@ pub fn command() -> impl Strategy<Value = Command> {
         (filter(), frame(), 0..4_u32).prop_map(|(filter, reply, count)| Trigger { filter, reply, count });
     let simple = prop::sample::select(vec![
         Command::Status,
+        Command::Failures,
         Command::Time,
         Command::Identify { seconds: 1 },
         Command::SaveDefaults,

@@ -13,8 +13,9 @@ use cantap_firmware::ports::{
 };
 use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::session::Session;
+use cantap_firmware::sof::SofReading;
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
-use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
+use cantap_wire::message::{ChannelConfig, EndReason, Failures, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{
     BitTiming, CHANNELS, Channel, Command, Decoded, Decoder, Event, Frame, Id, PROTOCOL_VERSION, Record,
@@ -145,6 +146,8 @@ pub struct FakeControl {
     pub running: bool,
     /// The bus is stuck: it does not leave by itself.
     pub stuck: bool,
+    /// Calls of `halt` until it has left.
+    pub halts_needed: usize,
     pub halts: usize,
     pub started: Vec<ChannelConfig>,
     pub resumed: usize,
@@ -156,8 +159,8 @@ impl Control for FakeControl {
     }
 
     fn halt(&mut self) {
-        self.running = false;
         self.halts += 1;
+        self.running &= self.halts < self.halts_needed;
     }
 
     fn is_stopped(&self) -> bool {
@@ -204,6 +207,10 @@ impl Chip for FakeChip {
         Some(3301)
     }
 
+    fn failures(&mut self) -> Failures {
+        Failures { count: 2, last: "a panic".try_into().unwrap() }
+    }
+
     fn identify(&mut self, seconds: u8) {
         self.identified.push(seconds);
     }
@@ -228,16 +235,17 @@ impl Chip for FakeChip {
     }
 }
 
-/// A port whose host takes so many packets and then none.
+/// A port whose host takes so many transfers and then none.
 #[derive(Default)]
 pub struct FakePort {
     pub open: bool,
+    pub suspended: bool,
     pub to_device: VecDeque<Vec<u8>>,
     pub from_device: Vec<u8>,
     pub packets: Vec<usize>,
     /// The host was told to wait.
     pub held: bool,
-    /// Packets that the host still takes.
+    /// Transfers that the host still takes.
     pub takes: usize,
 }
 
@@ -246,15 +254,21 @@ impl Port for FakePort {
         self.open
     }
 
-    fn write(&mut self, packet: &[u8]) -> bool {
-        assert!(packet.len() <= PACKET);
+    fn is_suspended(&self) -> bool {
+        self.suspended
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> Option<usize> {
         if self.takes == 0 {
-            return false;
+            return None;
         }
+        // A transfer of at most five packets.
+        let len = bytes.len().min(5 * PACKET);
         self.takes -= 1;
-        self.packets.push(packet.len());
-        self.from_device.extend_from_slice(packet);
-        true
+        self.packets.extend(bytes[..len].chunks(PACKET).map(<[u8]>::len));
+        self.packets.extend((len == 0).then_some(0));
+        self.from_device.extend_from_slice(&bytes[..len]);
+        Some(len)
     }
 
     fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
@@ -275,6 +289,8 @@ pub struct FakeBoard<'q, const N: usize> {
     pub clock: FakeClock,
     pub filters: FakeFilters,
     pub chip: FakeChip,
+    /// What the next reading of the SOF latch finds.
+    pub sof: Option<SofReading>,
 }
 
 impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
@@ -293,6 +309,10 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
 
     fn now(&self) -> u32 {
         self.clock.now()
+    }
+
+    fn take_sof(&mut self) -> Option<SofReading> {
+        self.sof.take()
     }
 
     fn control(&mut self, channel: Channel) -> &mut FakeControl {
@@ -316,6 +336,8 @@ pub struct Bench<'q, const N: usize> {
     pub decoder: Decoder,
     pub records: Vec<(u64, Record)>,
     pub responses: Vec<Response>,
+    /// When the device ended a session by itself, and why.
+    pub ends: Vec<(u64, EndReason)>,
     /// Anything else that the decoder said.
     pub complaints: Vec<String>,
     decoded: usize,
@@ -335,12 +357,14 @@ impl<'q, const N: usize> Bench<'q, N> {
                 clock: FakeClock::default(),
                 filters: FakeFilters::default(),
                 chip: FakeChip::default(),
+                sof: None,
             },
             session: Session::new(consumer, identity),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
             decoder: Decoder::new(),
             records: Vec::new(),
             responses: Vec::new(),
+            ends: Vec::new(),
             complaints: Vec::new(),
             decoded: 0,
             next_id: 1,
@@ -366,6 +390,12 @@ impl<'q, const N: usize> Bench<'q, N> {
         self.ask(Command::Hello { protocol: PROTOCOL_VERSION }).unwrap();
     }
 
+    /// The host puts the bus to sleep with the port open, or wakes it.
+    pub fn sleep(&mut self, asleep: bool) {
+        self.port.suspended = asleep;
+        self.port.open = !asleep;
+    }
+
     /// Bytes from the host, in packets.
     pub fn say(&mut self, bytes: &[u8]) {
         self.port.to_device.extend(bytes.chunks(PACKET).map(<[u8]>::to_vec));
@@ -389,17 +419,15 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// One poll of the session, and what it sent decoded.
     pub fn poll(&mut self) {
         self.session.poll(&mut self.port, &mut self.board);
-        let Self { decoder, records, responses, complaints, .. } = self;
+        let Self { decoder, records, responses, ends, complaints, .. } = self;
         let bytes = &self.port.from_device[self.decoded..];
         decoder.push(bytes, |decoded| match decoded {
             Decoded::Record { ticks, record } => records.push((ticks, record)),
             Decoded::Response(response) => responses.push(response.clone()),
+            Decoded::Ended { ticks, reason } => ends.push((ticks, reason)),
             other => complaints.push(format!("{other:?}")),
         });
         self.decoded = self.port.from_device.len();
-        if self.responses.iter().any(|response| matches!(response.result, Ok(Reply::Hello(_)))) {
-            self.decoder.restart();
-        }
     }
 
     /// The transmit interrupt.
@@ -417,6 +445,7 @@ impl<'q, const N: usize> Bench<'q, N> {
             }
         }
         self.board.capture.on_tick(&mut self.board.traffic, &self.board.clock);
+        self.session.tick(&mut self.board);
         self.poll();
     }
 

@@ -1,23 +1,11 @@
 //! Batches: records packed so that each batch stands alone. Losing one loses its records only, and
 //! the next one says exactly how many frames those were.
 
-use serde::{Deserialize, Serialize};
-
-use crate::framing::{CRC_LEN, MAX_MESSAGE, seal};
-use crate::message::DeviceMessage;
+use crate::framing::{CRC_LEN, MAX_MESSAGE, crc32, seal, seal_with};
+use crate::message::{DeviceMessage, EndReason, SessionEnd};
 use crate::{CHANNELS, Channel};
 
-/// Stands in front of a batch's records.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-pub struct BatchHeader {
-    /// Counts batches from 0 at `Hello`; wraps.
-    pub sequence: u32,
-    /// Absolute device time, in ticks, that the first record's time difference is added to.
-    pub base_ticks: u64,
-    /// Received-frame records in all batches before this one since `Hello`, per channel; wraps. The
-    /// host takes from it how many frames went with a lost batch.
-    pub frames_before: [u32; CHANNELS],
-}
+pub use crate::message::BatchHeader;
 
 /// Room a header takes at most: message kind, sequence, base, two counts.
 const MAX_HEADER: usize = 1 + 5 + 10 + 2 * 5;
@@ -65,7 +53,13 @@ impl BatchWriter {
     /// time that its time difference is relative to; `frame_of` its channel if it is a received
     /// frame.
     pub fn push(&mut self, record: &[u8], base_ticks: u64, frame_of: Option<Channel>) -> bool {
-        if record.len() > self.room() {
+        let frames = Channel::ALL.map(|channel| u32::from(frame_of == Some(channel)));
+        self.append(record, base_ticks, frames)
+    }
+
+    /// Appends whole encoded records, as [`Self::push`] does one after the other; `frames` of each channel are among them.
+    pub fn append(&mut self, records: &[u8], base_ticks: u64, frames: [u32; CHANNELS]) -> bool {
+        if records.len() > self.room() {
             return false;
         }
         if self.len == 0 {
@@ -75,22 +69,37 @@ impl BatchWriter {
             self.len = postcard::to_slice(&message, &mut self.message).map_or(0, |header| header.len());
             self.header_len = self.len;
         }
-        self.message[self.len..self.len + record.len()].copy_from_slice(record);
-        self.len += record.len();
-        if let Some(channel) = frame_of {
-            let frames = &mut self.frames[channel.index()];
-            *frames = frames.wrapping_add(1);
+        self.message[self.len..self.len + records.len()].copy_from_slice(records);
+        self.len += records.len();
+        for (all, more) in self.frames.iter_mut().zip(frames) {
+            *all = all.wrapping_add(more);
         }
         true
+    }
+
+    /// Writes the session's end, encoded and with its zero byte, into `out` and returns its length. To be called when the last
+    /// batch is finished; `out` as for [`Self::finish`].
+    pub fn end(&mut self, reason: EndReason, at_ticks: u64, out: &mut [u8]) -> usize {
+        let header =
+            BatchHeader { sequence: self.sequence, base_ticks: at_ticks, frames_before: self.frames };
+        let message = DeviceMessage::Ended(SessionEnd { reason, header });
+        // Cannot fail: the buffer is longer than the longest header.
+        let len = postcard::to_slice(&message, &mut self.message).map_or(0, |message| message.len());
+        seal(&mut self.message, len, out).unwrap_or(0)
     }
 
     /// Writes the batch, encoded and with its zero byte, into `out` and returns its length; 0 if it
     /// is empty. `out` needs [`crate::framing::MAX_ENCODED`] bytes; with less, the batch stays.
     pub fn finish(&mut self, out: &mut [u8]) -> usize {
+        self.finish_with(out, crc32)
+    }
+
+    /// The same for who has a faster way to the CRC of a message than [`crc32`].
+    pub fn finish_with(&mut self, out: &mut [u8], crc32: impl FnOnce(&[u8]) -> u32) -> usize {
         if self.is_empty() {
             return 0;
         }
-        let Some(encoded) = seal(&mut self.message, self.len, out) else {
+        let Some(encoded) = seal_with(&mut self.message, self.len, out, crc32) else {
             return 0;
         };
         self.len = 0;

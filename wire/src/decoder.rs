@@ -5,7 +5,7 @@
 
 use crate::batch::BatchHeader;
 use crate::framing::{FramingError, MAX_ENCODED, unseal};
-use crate::message::{DeviceMessage, Response};
+use crate::message::{DeviceMessage, EndReason, Reply, Response, SessionEnd};
 use crate::record::{self, Record};
 use crate::{CHANNELS, PROTOCOL_VERSION};
 
@@ -18,7 +18,13 @@ pub enum Corruption {
     TooLong,
     /// A message that is not of this protocol version.
     Unknown,
-    /// A batch that is older than one already seen. Its frames were reported as lost.
+    /// The last batch once more. Nothing is missing.
+    Repeated {
+        /// Its sequence number.
+        sequence: u32,
+    },
+    /// A batch that is older than one already seen. A device never goes back within a session: this one is another's, and
+    /// how many frames are missing nobody can tell.
     OutOfOrder {
         /// Its sequence number.
         sequence: u32,
@@ -48,6 +54,13 @@ pub enum Decoded<'a> {
         /// How many received frames went with them, per channel.
         frames: [u32; CHANNELS],
     },
+    /// The device has ended the session; nothing of it follows.
+    Ended {
+        /// Ticks since the device started, when both channels were off their buses.
+        ticks: u64,
+        /// Why.
+        reason: EndReason,
+    },
     /// Bytes were thrown away.
     Corrupt(Corruption),
     /// The device speaks this other protocol version.
@@ -60,9 +73,46 @@ pub struct Decoder {
     len: usize,
     /// Throwing away up to the next zero.
     overlong: bool,
+    expected: Expected,
+    message: [u8; MAX_ENCODED],
+}
+
+/// What the next batch's header should say.
+struct Expected {
     sequence: u32,
     frames: [u32; CHANNELS],
-    message: [u8; MAX_ENCODED],
+    /// The last batch's, to tell a repetition.
+    last: Option<BatchHeader>,
+}
+
+impl Expected {
+    const FIRST: Self = Self { sequence: 0, frames: [0; CHANNELS], last: None };
+
+    /// Holds a header against what was expected. Returns whether the batch may be read.
+    fn take(&mut self, header: &BatchHeader, report: &mut impl FnMut(Decoded<'_>)) -> bool {
+        let goes_back = |ahead: u32| ahead > u32::MAX / 2;
+        let ahead = header.sequence.wrapping_sub(self.sequence);
+        let lost =
+            core::array::from_fn(|channel| header.frames_before[channel].wrapping_sub(self.frames[channel]));
+        if goes_back(ahead) || lost.into_iter().any(goes_back) {
+            let sequence = header.sequence;
+            report(Decoded::Corrupt(if self.last.as_ref() == Some(header) {
+                Corruption::Repeated { sequence }
+            } else {
+                Corruption::OutOfOrder { sequence }
+            }));
+            return false;
+        }
+        if ahead > 0 || lost != [0; CHANNELS] {
+            report(Decoded::BatchesLost { batches: ahead, frames: lost });
+        }
+        *self = Self {
+            sequence: header.sequence.wrapping_add(1),
+            frames: header.frames_before,
+            last: Some(*header),
+        };
+        true
+    }
 }
 
 impl Decoder {
@@ -72,16 +122,9 @@ impl Decoder {
             partial: [0; MAX_ENCODED],
             len: 0,
             overlong: false,
-            sequence: 0,
-            frames: [0; CHANNELS],
+            expected: Expected::FIRST,
             message: [0; MAX_ENCODED],
         }
-    }
-
-    /// Expects the first batch of a session again. To be called when the response to `Hello` came.
-    pub fn restart(&mut self) {
-        self.sequence = 0;
-        self.frames = [0; CHANNELS];
     }
 
     /// Takes any piece of the stream and reports what is complete.
@@ -132,15 +175,26 @@ impl Decoder {
         };
         match postcard::take_from_bytes(message) {
             Ok((DeviceMessage::Batch(header), records)) => {
-                if expect(&mut self.sequence, &mut self.frames, &header, report) {
-                    walk(records, header.base_ticks, &mut self.frames, report);
+                if self.expected.take(&header, report) {
+                    walk(records, header.base_ticks, &mut self.expected.frames, report);
+                }
+            }
+            Ok((DeviceMessage::Ended(SessionEnd { reason, header }), [])) => {
+                if self.expected.take(&header, report) {
+                    report(Decoded::Ended { ticks: header.base_ticks, reason });
                 }
             }
             // A Hello whose fixed first field tells another version is not read any further.
-            Ok((DeviceMessage::Response(response), [])) => match foreign_protocol(message) {
-                Some(version) => report(Decoded::OtherProtocol(version)),
-                None => report(Decoded::Response(&response)),
-            },
+            Ok((DeviceMessage::Response(response), [])) => {
+                if let Some(version) = foreign_protocol(message) {
+                    return report(Decoded::OtherProtocol(version));
+                }
+                if matches!(response.result, Ok(Reply::Hello(_))) {
+                    // A session begins: the next batch is its first, and may stand right behind.
+                    self.expected = Expected::FIRST;
+                }
+                report(Decoded::Response(&response));
+            }
             _ => match foreign_protocol(message) {
                 Some(version) => report(Decoded::OtherProtocol(version)),
                 None => report(Decoded::Corrupt(Corruption::Unknown)),
@@ -155,27 +209,6 @@ impl Default for Decoder {
     }
 }
 
-/// Holds the header against what was expected. Returns whether the batch may be read.
-fn expect(
-    sequence: &mut u32,
-    frames: &mut [u32; CHANNELS],
-    header: &BatchHeader,
-    report: &mut impl FnMut(Decoded<'_>),
-) -> bool {
-    let ahead = header.sequence.wrapping_sub(*sequence);
-    if ahead > u32::MAX / 2 {
-        report(Decoded::Corrupt(Corruption::OutOfOrder { sequence: header.sequence }));
-        return false;
-    }
-    let lost = core::array::from_fn(|channel| header.frames_before[channel].wrapping_sub(frames[channel]));
-    if ahead > 0 || lost != [0; CHANNELS] {
-        report(Decoded::BatchesLost { batches: ahead, frames: lost });
-    }
-    *sequence = header.sequence.wrapping_add(1);
-    *frames = header.frames_before;
-    true
-}
-
 /// Reports a batch's records.
 fn walk(
     mut records: &[u8],
@@ -188,7 +221,7 @@ fn walk(
         let Ok((record, difference, rest)) = record::decode(records) else {
             return report(Decoded::Corrupt(Corruption::Records));
         };
-        ticks = ticks.wrapping_add_signed(i64::from(difference));
+        ticks = ticks.wrapping_add_signed(difference);
         if let Record::Received(received) = &record {
             let frames = &mut frames[received.channel.index()];
             *frames = frames.wrapping_add(1);

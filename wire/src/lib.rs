@@ -1,28 +1,26 @@
-//! What crosses USB between a cantap device and its host: the types, the framing, the limits and
-//! the version. Everything here exists once; the firmware, the host library and the emulator all
-//! use it, and `docs/wire-protocol.md` describes it for clients in other languages.
+#![doc = include_str!("../README.md")]
 //!
-//! No allocation and no `std`. It does no I/O and keeps no time of its own.
+//! Everything here exists once: the firmware, the host library and the emulator all use it.
+
+#![forbid(unsafe_code)]
 #![cfg_attr(not(test), no_std)]
 
 pub mod batch;
 pub mod decoder;
-pub mod frame;
 pub mod framing;
 pub mod message;
+mod packed;
 pub mod record;
-pub mod timing;
 mod varint;
 
+pub use cantap_can::{BitTiming, Frame, Id, frame, timing};
 pub use decoder::{Corruption, Decoded, Decoder};
-pub use frame::{Frame, Id};
 pub use message::{Command, Hello, Refusal, Reply, Request, Response};
 pub use record::{Event, Received, Record, Stamp};
-pub use timing::BitTiming;
 
 /// Version of everything this crate defines. A device and a host with different versions refuse
 /// each other with a message that says which side to update.
-pub const PROTOCOL_VERSION: u16 = 2;
+pub const PROTOCOL_VERSION: u16 = 3;
 
 /// Name of the ELF symbol that holds [`PROTOCOL_VERSION`] as a little-endian `u16` in the
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.

@@ -4,8 +4,7 @@
 use heapless::{String, Vec};
 use serde::{Deserialize, Serialize};
 
-use crate::Channel;
-use crate::batch::BatchHeader;
+use crate::{CHANNELS, Channel};
 
 mod bytes;
 mod channel;
@@ -14,7 +13,7 @@ mod transmission;
 
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
-pub use status::{ChannelStatus, RegisterSet, Registers, Status};
+pub use status::{ChannelStatus, Failures, MAX_FAILURE_TEXT, RegisterSet, Registers, Status};
 pub use transmission::{
     Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, Periodic, TRIGGER_TAG, Trigger, TxFrame,
 };
@@ -33,6 +32,18 @@ pub struct Request {
     pub command: Command,
 }
 
+/// Stands in front of a batch's records.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct BatchHeader {
+    /// Counts batches from 0 at `Hello`; wraps.
+    pub sequence: u32,
+    /// Absolute device time, in ticks, that the first record's time difference is added to.
+    pub base_ticks: u64,
+    /// Received-frame records in all batches before this one since `Hello`, per channel; wraps. The
+    /// host takes from it how many frames went with a lost batch.
+    pub frames_before: [u32; CHANNELS],
+}
+
 /// Device → host.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[allow(clippy::large_enum_variant, reason = "no allocation on the device")]
@@ -41,6 +52,26 @@ pub enum DeviceMessage {
     Batch(BatchHeader),
     /// An answer.
     Response(Response),
+    /// The device has ended the session.
+    Ended(SessionEnd),
+}
+
+/// Told behind everything else of a session that the device has ended by itself. What is asked then, except `Hello`, is
+/// refused with [`Refusal::NoSession`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SessionEnd {
+    /// Why.
+    pub reason: EndReason,
+    /// What the next batch would have begun with, its base the time at which both channels were off their buses: a host that has
+    /// decoded less knows exactly how much it has lost.
+    pub header: BatchHeader,
+}
+
+/// Why a device ended a session.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub enum EndReason {
+    /// The host suspended the bus, and woke it again without having closed the port.
+    Suspended,
 }
 
 /// The one answer that every request gets.
@@ -151,6 +182,8 @@ pub enum Command {
         /// Which.
         channel: Channel,
     },
+    /// Asks for [`Failures`]. They stay until the device loses its power.
+    Failures,
 }
 
 /// A value that answers a request.
@@ -183,6 +216,8 @@ pub enum Reply {
     Registers(Registers),
     /// To [`Command::Defaults`].
     Defaults(Defaults),
+    /// To [`Command::Failures`].
+    Failures(Failures),
 }
 
 /// What is stored for a channel over a power cycle.

@@ -8,20 +8,24 @@
 //! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
-//! Time differences are postcard's `i32` (zigzag, 7 bits a byte), in ticks since the record before.
-//! They are signed because a stamp may be computed back to before the other channel's last one.
+//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the record before.
+//! They are signed because a stamp may be computed back to before the other channel's last one, and wide because nothing bounds
+//! the time between two records: a host may open a channel hours after its greeting, or read nothing for as long.
 
+pub use cantap_can::{BusErrorKind, ErrorState};
 use serde::{Deserialize, Serialize};
 
-use crate::frame::take_data;
+use crate::packed::take_data;
 use crate::varint::take_u32;
 use crate::{Channel, Frame, Id};
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
-pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + 5 + 8;
+pub const MAX_FRAME_RECORD: usize = 1 + 1 + 4 + MAX_TICKS + 8;
 /// Bytes of the longest record of any kind: an [`Event::Transmitted`] with eight data bytes, which is
 /// index, channel, tag, packed ID, DLC, length, data and time difference.
-pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + 5;
+pub const MAX_RECORD: usize = 1 + 1 + 5 + 5 + 1 + 1 + 8 + MAX_TICKS;
+/// Bytes of the longest time difference: 64 bits, 7 a byte.
+const MAX_TICKS: usize = 10;
 
 /// The index of [`Event::Transmitted`].
 const TRANSMITTED: u8 = 6;
@@ -69,36 +73,6 @@ pub enum LossStage {
     Host,
 }
 
-/// The error that a controller reports in its last-error code.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
-pub enum BusErrorKind {
-    /// More than five equal bits in a row.
-    Stuff,
-    /// A fixed-form field had an illegal bit.
-    Form,
-    /// A transmitted frame was not acknowledged.
-    Acknowledgment,
-    /// Sent recessive, read dominant.
-    BitRecessive,
-    /// Sent dominant, read recessive.
-    BitDominant,
-    /// The CRC of a received frame was wrong.
-    Crc,
-}
-
-/// The state of a controller's fault confinement (ISO 11898-1).
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-pub enum ErrorState {
-    /// Error active: both counters below 96.
-    Active,
-    /// A counter reached 96.
-    Warning,
-    /// Error passive: a counter passed 127.
-    Passive,
-    /// The transmit error counter passed 255; the controller is off the bus.
-    BusOff,
-}
-
 /// Why a frame was not sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub enum TransmitFailure {
@@ -112,8 +86,11 @@ pub enum TransmitFailure {
     Closed,
     /// The controller went bus-off and recovery is manual.
     BusOff,
-    /// A periodic frame's period passed again before the bus took it.
-    Overtaken,
+    /// A periodic frame's next periods began before the bus took it. The frame still waits, and its end is told once.
+    Overtaken {
+        /// How many, since this was told last for the entry.
+        periods: u32,
+    },
 }
 
 /// Everything in the stream that is not a received frame. The order of the variants is the wire
@@ -178,9 +155,10 @@ pub enum Event {
         /// sends by itself, see [`crate::message::DEVICE_TAG`].
         tag: u32,
         /// The frame as sent.
+        #[serde(with = "crate::packed")]
         frame: Frame,
     },
-    /// A frame was not sent and will not be.
+    /// A frame was not sent and will not be; or periods passed without one ([`TransmitFailure::Overtaken`]).
     TransmitFailed {
         /// Where.
         channel: Channel,
@@ -189,8 +167,16 @@ pub enum Event {
         /// Why.
         reason: TransmitFailure,
     },
-    /// Nothing happened for so long that the next time difference would not fit.
-    TimeMark,
+    /// The start of a USB frame. The record's time is the stamp timer as the hardware latched it when the
+    /// frame's SOF token had been received: device ticks against the clock of the host's USB controller.
+    /// About once a second in a session, whether a channel is open or not; none where no SOF was latched.
+    SofMark {
+        /// The frame number in that token: 11 bits, one more each millisecond, 0 after 2047.
+        frame: u16,
+        /// Milliseconds since the last mark in which more than one SOF was latched. Near 1000 when a host
+        /// or a chip makes two of each; then half of the latched times are not a frame's start.
+        doubled: u16,
+    },
 }
 
 /// One entry of the stream. Its absolute time is the decoder's business.
@@ -208,7 +194,7 @@ pub struct BadRecord;
 
 /// Writes a received frame and returns its length. `ticks` is the time since the record before.
 #[inline]
-pub fn encode_received(received: &Received, ticks: i32, out: &mut [u8; MAX_RECORD]) -> usize {
+pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     let frame = &received.frame;
     let mut qualifiers = match received.stamp {
         Stamp::Exact => 0,
@@ -246,15 +232,17 @@ pub fn encode_received(received: &Received, ticks: i32, out: &mut [u8; MAX_RECOR
 }
 
 /// Writes an event and returns its length. `ticks` is the time since the record before.
-pub fn encode_event(event: &Event, ticks: i32, out: &mut [u8; MAX_RECORD]) -> usize {
+pub fn encode_event(event: &Event, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     // Cannot fail: the buffer holds the longest event there is (tested below).
     let len = postcard::to_slice(event, &mut out[..]).map_or(0, |written| written.len());
     len + encode_ticks(ticks, &mut out[len..])
 }
 
-/// postcard's `i32`.
+/// postcard's `i64`.
 #[inline]
-fn encode_ticks(ticks: i32, out: &mut [u8]) -> usize {
+fn encode_ticks(ticks: i64, out: &mut [u8]) -> usize {
+    // Nearly all there are; and half the registers, on the device.
+    let Ok(ticks) = i32::try_from(ticks) else { return encode_long_ticks(ticks, out) };
     let mut zigzag = ((ticks << 1) ^ (ticks >> 31)) as u32;
     let mut len = 0;
     while zigzag >= 0x80 {
@@ -266,21 +254,28 @@ fn encode_ticks(ticks: i32, out: &mut [u8]) -> usize {
     len + 1
 }
 
-/// postcard's `i32`, with what follows it.
+#[cold]
+#[inline(never)]
+fn encode_long_ticks(ticks: i64, out: &mut [u8]) -> usize {
+    // Cannot fail: the buffer holds the longest record.
+    postcard::to_slice(&ticks, out).map_or(0, |written| written.len())
+}
+
+/// postcard's `i64`, with what follows it.
 #[inline]
-fn decode_ticks(bytes: &[u8]) -> Result<(i32, &[u8]), BadRecord> {
+fn decode_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
     // One and two bytes are nearly all there is; postcard takes the rest.
-    let zigzag = match *bytes {
+    let (zigzag, rest) = match *bytes {
         [a, ref rest @ ..] if a < 0x80 => (u32::from(a), rest),
         [a, b, ref rest @ ..] if b < 0x80 => (u32::from(a & 0x7F) | u32::from(b) << 7, rest),
         _ => return postcard::take_from_bytes(bytes).map_err(|_| BadRecord),
     };
-    Ok(((zigzag.0 >> 1) as i32 ^ -((zigzag.0 & 1) as i32), zigzag.1))
+    Ok((i64::from((zigzag >> 1) as i32 ^ -((zigzag & 1) as i32)), rest))
 }
 
 /// Reads one record: the record, its time difference in ticks, and what follows it.
 #[inline]
-pub fn decode(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
+pub fn decode(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     // Nearly every record is a frame without qualifiers.
     match *bytes {
         [header @ FRAME..=0xFF, ref rest @ ..] => decode_frame(0, header, rest),
@@ -297,7 +292,7 @@ pub fn decode(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
 }
 
 #[cold]
-fn decode_event(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
+fn decode_event(bytes: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     let (event, rest) = postcard::take_from_bytes::<Event>(bytes).map_err(|_| BadRecord)?;
     let (ticks, rest) = decode_ticks(rest)?;
     Ok((Record::Event(event), ticks, rest))
@@ -306,7 +301,7 @@ fn decode_event(bytes: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
 /// Reads a received frame behind its header byte.
 #[inline(always)]
 #[allow(clippy::inline_always, reason = "the host's decoder is a third slower without")]
-fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i32, &[u8]), BadRecord> {
+fn decode_frame(qualifiers: u8, header: u8, rest: &[u8]) -> Result<(Record, i64, &[u8]), BadRecord> {
     let stamp = match qualifiers & (UPPER_BOUND | NO_STAMP) {
         0 => Stamp::Exact,
         UPPER_BOUND => Stamp::UpperBound,
@@ -338,7 +333,7 @@ pub struct Outline {
     /// Bytes of it.
     pub len: usize,
     /// Its time difference, in ticks.
-    pub ticks: i32,
+    pub ticks: i64,
     /// Its channel, if it is a received frame.
     pub frame_of: Option<Channel>,
 }
@@ -404,7 +399,7 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_frame_round_trips(received in received(), ticks: i32, tail: Vec<u8>) {
+        fn any_frame_round_trips(received in received(), ticks: i64, tail: Vec<u8>) {
             let mut out = [0; MAX_RECORD];
             let len = encode_received(&received, ticks, &mut out);
             prop_assert!(len <= MAX_FRAME_RECORD);
@@ -419,7 +414,7 @@ mod tests {
         fn a_confirmation_s_outline_says_what_decoding_says(
             received in received(),
             tag: u32,
-            ticks: i32,
+            ticks: i64,
             tail: Vec<u8>,
         ) {
             let event = Event::Transmitted { channel: received.channel, tag, frame: received.frame };
@@ -457,8 +452,8 @@ mod tests {
         let frame = Frame::data_frame(Id::extended(Id::MAX_EXTENDED).unwrap(), &[0xFF; 8]).unwrap();
         let event = Event::Transmitted { channel: Channel::Can2, tag: u32::MAX, frame };
         let mut out = [0; MAX_RECORD];
-        let len = encode_event(&event, i32::MIN, &mut out);
+        let len = encode_event(&event, i64::MIN, &mut out);
         assert_eq!(len, MAX_RECORD);
-        assert_eq!(decode(&out), Ok((Record::Event(event), i32::MIN, &[][..])));
+        assert_eq!(decode(&out), Ok((Record::Event(event), i64::MIN, &[][..])));
     }
 }

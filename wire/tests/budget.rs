@@ -6,10 +6,10 @@ use cantap_wire::record::{MAX_RECORD, encode_received};
 use cantap_wire::{Channel, Frame, Received, Stamp};
 
 /// 12 ticks per µs.
-const TICKS_PER_BIT: i32 = 12;
+const TICKS_PER_BIT: i64 = 12;
 
 /// Fills batches with one frame over and over, on one channel of 1 Mbit/s at full load, after three days.
-fn bytes_per_frame(text: &str, bits_on_bus: i32) -> f64 {
+fn bytes_per_frame(text: &str, bits_on_bus: i64) -> f64 {
     let frame: Frame = text.parse().unwrap();
     let received = Received { channel: Channel::Can1, frame, stamp: Stamp::Exact, data_omitted: false };
     let mut record = [0; MAX_RECORD];

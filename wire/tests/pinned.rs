@@ -5,9 +5,9 @@ use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::batch::BatchHeader;
 use cantap_wire::framing::MAX_REQUEST;
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, DeviceMessage, Filter, FrameKind, MAX_FILTERS,
-    MAX_SEND, Mode, Modifier, Periodic, RegisterSet, Registers, Status, Trigger, TxFrame, capability,
-    read_send, why_unreadable, write_response,
+    ChannelConfig, ChannelStatus, Checksum, Defaults, DeviceMessage, EndReason, Failures, Filter, FrameKind,
+    MAX_FILTERS, MAX_SEND, Mode, Modifier, Periodic, RegisterSet, Registers, SessionEnd, Status, Trigger,
+    TxFrame, capability, read_send, why_unreadable, write_response,
 };
 use cantap_wire::record::{
     BusErrorKind, ErrorState, LossStage, MAX_RECORD, TransmitFailure, encode_event, encode_received,
@@ -41,7 +41,7 @@ const TIMING: BitTiming = BitTiming { prescaler: 300, segment1: 13, segment2: 2,
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 2);
+    assert_eq!(PROTOCOL_VERSION, 3);
 }
 
 #[test]
@@ -56,9 +56,12 @@ fn received_frames() {
     assert_eq!(record("555#R2", Can2, Stamp::Exact, false, -1), "d2 55 05 01");
     assert_eq!(record("123#DEADBEEF", Can2, Stamp::Exact, false, 0), "c4 23 01 00 de ad be ef");
     assert_eq!(
-        record("1F334455#11", Can1, Stamp::Exact, false, i32::MAX),
+        record("1F334455#11", Can1, Stamp::Exact, false, i64::from(i32::MAX)),
         "a1 55 44 33 1f fe ff ff ff 0f 11"
     );
+    // Two wraps of a 32-bit timer: a difference has no bound.
+    assert_eq!(record("1F334455#11", Can1, Stamp::Exact, false, 2 << 32), "a1 55 44 33 1f 80 80 80 80 40 11");
+    assert_eq!(record("555#", Can1, Stamp::Exact, false, i64::MIN), "80 55 05 ff ff ff ff ff ff ff ff ff 01");
     assert_eq!(record("1F334455#11", Can1, Stamp::UpperBound, false, 64), "41 a1 55 44 33 1f 80 01 11");
     assert_eq!(record("123#1122", Can1, Stamp::Omitted, false, 64), "42 82 23 01 11 22");
     assert_eq!(record("123#1122", Can1, Stamp::Exact, true, 1), "44 82 23 01 02");
@@ -98,8 +101,12 @@ fn events() {
         (Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::Aborted }, "07 01 02 02"),
         (Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::Closed }, "07 01 02 03"),
         (Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::BusOff }, "07 01 02 04"),
-        (Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::Overtaken }, "07 01 02 05"),
-        (Event::TimeMark, "08"),
+        (Event::SofMark { frame: 2047, doubled: 0 }, "08 ff 0f 00"),
+        (Event::SofMark { frame: 0, doubled: 300 }, "08 00 ac 02"),
+        (
+            Event::TransmitFailed { channel, tag: 2, reason: TransmitFailure::Overtaken { periods: 300 } },
+            "07 01 02 05 ac 02",
+        ),
     ] {
         let mut out = [0; MAX_RECORD];
         let len = encode_event(&event, 576, &mut out);
@@ -128,7 +135,7 @@ fn commands() {
     };
     let tx = |tag, at_ticks| TxFrame { tag, frame, at_ticks };
     for (command, expected) in vec![
-        (Command::Hello { protocol: 2 }, "00 02"),
+        (Command::Hello { protocol: 3 }, "00 03"),
         (Command::Open { channel, config: None }, "01 01 00"),
         (Command::Open { channel, config: Some(config) }, "01 01 01 ac 02 0d 02 01 00 01 00 00 00"),
         (Command::Close { channel }, "02 01"),
@@ -159,6 +166,7 @@ fn commands() {
         (Command::ClearDefaults, "10"),
         (Command::Configure { channel, config }, "11 01 ac 02 0d 02 01 00 01 00 00 00"),
         (Command::Defaults { channel }, "12 01"),
+        (Command::Failures, "13"),
     ] {
         assert_eq!(
             bytes(&Request { id: 300, command: command.clone() }),
@@ -177,7 +185,7 @@ fn replies() {
         ChannelConfig { manual_recovery: true, omit_data: true, ..ChannelConfig::listen_only(TIMING) };
     let filter = Filter { extended: true, kind: FrameKind::Remote, id: 300, mask: 1 };
     let hello = Hello {
-        protocol: 2,
+        protocol: 3,
         firmware: [0, 1, 300],
         board: "ab".try_into().unwrap(),
         serial: "c".try_into().unwrap(),
@@ -232,7 +240,7 @@ fn replies() {
     for (reply, expected) in [
         (
             Reply::Hello(hello),
-            "00 02 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
+            "00 03 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
         ),
         (Reply::Done, "01"),
         (Reply::Opened(config), "02 ac 02 0d 02 01 00 00 01 01 00"),
@@ -253,6 +261,7 @@ fn replies() {
             Reply::Defaults(Defaults { config, filters: [filter].into_iter().collect() }),
             "08 ac 02 0d 02 01 00 00 01 01 00 01 01 01 ac 02 01",
         ),
+        (Reply::Failures(Failures { count: 300, last: "ab".try_into().unwrap() }), "09 ac 02 02 61 62"),
     ] {
         let message = DeviceMessage::Response(Response { id: 5, result: Ok(reply.clone()) });
         assert_eq!(bytes(&message), format!("01 05 00 {expected}"), "{message:?}");
@@ -291,9 +300,11 @@ fn refusals() {
 }
 
 #[test]
-fn batch_headers() {
+fn batch_headers_and_the_end_of_a_session() {
     let header = BatchHeader { sequence: 300, base_ticks: 1 << 32, frames_before: [128, 1] };
     assert_eq!(bytes(&DeviceMessage::Batch(header)), "00 ac 02 80 80 80 80 10 80 01 01");
+    let end = SessionEnd { reason: EndReason::Suspended, header };
+    assert_eq!(bytes(&DeviceMessage::Ended(end)), "02 00 ac 02 80 80 80 80 10 80 01 01");
 }
 
 /// What a device reads apart must be what the whole type reads.

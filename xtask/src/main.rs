@@ -2,10 +2,13 @@
 //!
 //! Kept light, because `cargo fw` builds it first: what only the benchmarks need hides behind a feature.
 
+#![forbid(unsafe_code)]
+
 mod bench;
 mod board;
 mod dist;
 mod firmware;
+mod kernel;
 mod peers;
 mod reproducible;
 mod size;

@@ -57,7 +57,8 @@ impl Peers {
     }
 }
 
-fn is_installed(program: &str) -> bool {
+/// Whether a program is on the path.
+pub fn is_installed(program: &str) -> bool {
     let path = std::env::var_os("PATH").unwrap_or_default();
     std::env::split_paths(&path).any(|dir| dir.join(program).is_file())
 }

@@ -8,7 +8,7 @@ use xshell::{Cmd, Shell, cmd};
 use crate::board::Board;
 use crate::peers::Peers;
 use crate::toolchain::Toolchain;
-use crate::{firmware, reproducible, size, workspace};
+use crate::{firmware, kernel, reproducible, size, workspace};
 
 /// What `cargo xtask test` takes.
 #[derive(clap::Args)]
@@ -37,11 +37,26 @@ enum Step {
     Host,
     /// The tests that run the firmware ELF on the emulated board.
     Emulated,
+    /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
+    Kernel,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
     /// Public items' documentation, with every link checked.
     Doc,
+    /// The library crates as they would be published: each packs.
+    Package,
 }
+
+/// What can be published, each behind what it needs.
+const PUBLISHED: [&str; 7] = [
+    "cantap-can",
+    "cantap-wire",
+    "cantap-trace",
+    "cantap-formats",
+    "cantap-signals",
+    "cantap-analysis",
+    "cantap",
+];
 
 /// Runs the steps one after the other and stops at the first that fails.
 pub fn run(args: &Args) -> Result<()> {
@@ -91,11 +106,16 @@ impl Step {
                 let test = cmd!(shell, "cargo test --locked -p cantap-sim --all-features");
                 with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
             }
+            Step::Kernel => kernel::run(shell)?,
             Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
             Step::Doc => {
                 cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
                     .env("RUSTDOCFLAGS", "-D warnings")
                     .run()?;
+            }
+            Step::Package => {
+                let packages = PUBLISHED.iter().flat_map(|name| ["-p", name]);
+                cmd!(shell, "cargo package --locked --allow-dirty --no-verify {packages...}").run()?;
             }
         }
         Ok(())

@@ -5,9 +5,10 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
+use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
-use cantap::{Address, Channel, Device};
 
+use crate::address::Address;
 use crate::{args, channel_args, interrupt};
 
 /// The command line.
@@ -34,7 +35,7 @@ pub struct Args {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     let started = Instant::now();
     let shown = std::io::stderr().is_terminal();
     let mut progress = |progress: Progress| {

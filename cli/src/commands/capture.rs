@@ -6,21 +6,20 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
-use cantap::device::Records;
-use cantap::filter::Filter;
-use cantap::formats::{Format, ReadOptions, TraceWriter, create_writer, open_reader};
-use cantap::trigger::{Trigger, TriggerCounts};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
-use cantap::{Address, Channel, Device, TraceEvent, TraceRecord};
+use cantap::{Channel, TraceEvent, TraceRecord};
+use cantap_formats::{Format, ReadOptions, TraceWriter, create_writer, open_reader};
+use cantap_signals::trigger::{Trigger, TriggerCounts};
+use cantap_trace::filter::Filter;
 
 use super::convert::{WriteArgs, report as report_left_out, shown};
+use crate::address::Address;
 use crate::args;
 use crate::channel_args::ChannelArgs;
-use crate::interrupt;
+use crate::live::LiveRecords;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
-use crate::rescue::Rescue;
 use crate::trigger_args::TriggerArgs;
 
 /// The command line.
@@ -69,8 +68,6 @@ pub struct Args {
 
 /// How long records may stay in memory while others follow slowly.
 const FLUSH_EVERY: Duration = Duration::from_millis(200);
-/// How often the end is looked for while nothing arrives.
-const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// A channel in the JSON object.
 #[derive(serde::Serialize)]
@@ -91,11 +88,21 @@ struct Summary {
     channels: Vec<ChannelSummary>,
     lost: Losses,
     clock_drift_ppm: Option<f64>,
+    /// If there were any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gaps: Option<GapSummary>,
     #[serde(skip_serializing_if = "Option::is_none")]
     trigger: Option<TriggerSummary>,
     /// After a failure: how many of the frames the file has.
     #[serde(skip_serializing_if = "Option::is_none")]
     frames_in_file: Option<u64>,
+}
+
+/// Times in which the device was not there. The frames of that time are in no count.
+#[derive(serde::Serialize)]
+struct GapSummary {
+    count: u32,
+    seconds: f64,
 }
 
 #[derive(serde::Serialize)]
@@ -125,41 +132,36 @@ fn needs_bit_rate(args: &Args) -> anyhow::Result<bool> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A virtual device without settings has no bit rate saved.
-    let may_be_saved = !matches!(&args.device, Address::Virtual(options) if !options.contains("settings="));
-    if !may_be_saved && needs_bit_rate(args)? {
+    if !args.device.may_have_saved() && needs_bit_rate(args)? {
         let message = "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
-    interrupt::watch()?;
-    let device = Device::open(&args.device)?;
+    let (open, channels, filters) = (args.open.clone(), args.channel, args.filter.clone());
+    let mut live = LiveRecords::open(&args.device, args.time, move |device| {
+        open.open(device, channels.iter(), Mode::ListenOnly, Some(&filters)).map(|_| ())
+    })?;
     let mut sink = Sink::create(args)?;
-    let opened = args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&args.filter))?;
     let started = Instant::now();
     let mut meters = Channel::ALL.map(|_| Meter::new(0));
-    for (channel, config) in &opened {
-        meters[channel.index()] = Meter::of(config, device.hello().can_clock_hz);
-        sink.omits_data[channel.index()] = config.omit_data;
-    }
-    let mut records = device.records();
-    let mut rescue = args.open.rescue(&device);
-    let end = write_until_asked(args, &mut records, &mut sink, &mut meters, &mut rescue);
-    // What was captured until now is written, whatever came in between.
-    let seconds = started.elapsed().as_secs_f64();
-    let end = end.and_then(|end| match end {
-        End::Asked => {
-            device.stop()?;
-            drain(args, &mut records, &mut sink, &mut meters)
+    if let Some(device) = live.line().device() {
+        for (channel, config) in device.open_channels() {
+            meters[channel.index()] = Meter::of(&config, device.hello().can_clock_hz);
+            sink.omits_data[channel.index()] = config.omit_data;
         }
-        End::Enough | End::NobodyReads => Ok(device.stop().map(|_| ())?),
-    });
+    }
+    let end = write_all(args, &mut live, &mut sink, &mut meters);
+    let seconds = started.elapsed().as_secs_f64();
     let trigger = sink.trigger.as_ref().map(TriggerSummary::of);
     let finished = sink.finish();
     let failed = end.is_err() || finished.is_err();
+    let gaps = live.line().gaps();
     let summary = Summary {
         seconds: rounded(seconds, 3),
         channels: args.channel.iter().map(|channel| summarize(channel, &meters)).collect(),
-        lost: Losses::of(&device.counters()),
-        clock_drift_ppm: device.clock().drift_ppm.map(|ppm| rounded(ppm, 2)),
+        lost: Losses::of(&live.line().counters()),
+        clock_drift_ppm: live.line().clock().drift_ppm.map(|ppm| rounded(ppm, 2)),
+        gaps: (gaps.count > 0)
+            .then(|| GapSummary { count: gaps.count, seconds: rounded(gaps.time.as_secs_f64(), 3) }),
         trigger,
         frames_in_file: if failed { frames_in_file(args) } else { None },
     };
@@ -182,72 +184,46 @@ impl Args {
     }
 }
 
-/// Why writing ended.
-enum End {
-    /// By the user or the time limit: what has been captured is still wanted.
-    Asked,
-    /// By the frame limit.
-    Enough,
-    /// The reader of our standard output went away.
-    NobodyReads,
-}
-
-fn write_until_asked(
+/// Writes what is captured until Ctrl-C or a limit, and what had been captured by then.
+fn write_all(
     args: &Args,
-    records: &mut Records,
+    live: &mut LiveRecords,
     sink: &mut Sink,
     meters: &mut [Meter; 2],
-    rescue: &mut Rescue<'_>,
-) -> anyhow::Result<End> {
-    let started = Instant::now();
-    let mut flushed = started;
-    loop {
-        rescue.look()?;
-        if interrupt::requested() || args.time.is_some_and(|time| started.elapsed() >= time) {
-            return Ok(End::Asked);
-        }
-        let Some(batch) = records.next_batch(LOOK_EVERY)? else { return Ok(End::Enough) };
+) -> anyhow::Result<()> {
+    let mut rescue = args.open.rescue();
+    let mut flushed = Instant::now();
+    let mut batch = Vec::new();
+    while live.next_batch(&mut batch)? {
         for record in batch.iter().filter(|record| args.counts(record)) {
             meters[usize::from(record.channel == 2)].push(record);
             if !args.accepts(record) {
                 continue;
             }
-            if !sink.write(record)? {
-                return Ok(End::NobodyReads);
-            }
-            if is_enough(args, meters)
-                || sink.trigger.as_ref().is_some_and(|trigger| args.trigger.is_over(trigger))
-            {
-                return Ok(End::Enough);
+            if !sink.write(record)? || is_enough(args, sink, meters) {
+                return live.end();
             }
         }
-        records.recycle(batch);
         if flushed.elapsed() >= FLUSH_EVERY {
             if !sink.flush()? {
-                return Ok(End::NobodyReads);
+                return live.end();
             }
             flushed = Instant::now();
         }
-    }
-}
-
-/// Writes what had been captured when the channels were closed.
-fn drain(args: &Args, records: &mut Records, sink: &mut Sink, meters: &mut [Meter; 2]) -> anyhow::Result<()> {
-    for record in records {
-        let record = record?;
-        if !args.counts(&record) {
-            continue;
+        match live.line().device().map(|device| rescue.look(device)) {
+            // The stream tells.
+            Some(Err(error)) if error.is_of_the_connection() => {}
+            Some(looked) => looked?,
+            None => {}
         }
-        if is_enough(args, meters) || args.accepts(&record) && !sink.write(&record)? {
-            break;
-        }
-        meters[usize::from(record.channel == 2)].push(&record);
     }
     Ok(())
 }
 
-fn is_enough(args: &Args, meters: &[Meter; 2]) -> bool {
+/// Whether a limit is reached, so that what follows is not wanted.
+fn is_enough(args: &Args, sink: &Sink, meters: &[Meter; 2]) -> bool {
     args.frames.is_some_and(|frames| meters.iter().map(Meter::frames).sum::<u64>() >= frames)
+        || sink.trigger.as_ref().is_some_and(|trigger| args.trigger.is_over(trigger))
 }
 
 fn summarize(channel: Channel, meters: &[Meter; 2]) -> ChannelSummary {
@@ -323,6 +299,11 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
         eprintln!("{in_file} of the {frames} frames are in '{}'", path.display());
     }
     eprintln!("lost: {}", summary.lost.line());
+    if let Some(GapSummary { count, seconds }) = &summary.gaps {
+        eprintln!(
+            "gaps: {count}, {seconds} s in which the device was not there: what was on the bus then nobody counted"
+        );
+    }
     if let Some(ppm) = summary.clock_drift_ppm {
         let how = if ppm < 0.0 { "slower" } else { "faster" };
         eprintln!("the device's clock runs {} ppm {how} than this computer's", ppm.abs());

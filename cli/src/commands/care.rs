@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::process::ExitCode;
 
-use cantap::{Address, Device};
+use crate::address::Address;
 
 /// The command line of `cantap identify`.
 #[derive(clap::Args)]
@@ -26,14 +26,14 @@ pub struct Reset {
 
 /// Runs `cantap identify`.
 pub fn identify(args: &Identify) -> anyhow::Result<ExitCode> {
-    Device::open(&args.device)?.identify(args.seconds)?;
+    args.device.open()?.identify(args.seconds)?;
     writeln!(std::io::stdout(), "its LEDs blink for {} s", args.seconds)?;
     Ok(ExitCode::SUCCESS)
 }
 
 /// Runs `cantap reset`.
 pub fn reset(args: &Reset) -> anyhow::Result<ExitCode> {
-    Device::open(&args.device)?.reset()?;
+    args.device.open()?.reset()?;
     writeln!(std::io::stdout(), "restarting")?;
     Ok(ExitCode::SUCCESS)
 }

@@ -2,8 +2,6 @@
 
 use std::process::ExitCode;
 
-use clap::CommandFactory;
-
 /// The command line.
 #[derive(clap::Args)]
 #[command(
@@ -15,10 +13,10 @@ pub struct Args {
     shell: clap_complete::Shell,
 }
 
-/// Runs it.
-pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+/// Runs it for the command that `line` describes.
+pub fn run(args: &Args, mut line: clap::Command) -> anyhow::Result<ExitCode> {
     let mut script = Vec::new();
-    clap_complete::generate(args.shell, &mut crate::Cli::command(), "cantap", &mut script);
+    clap_complete::generate(args.shell, &mut line, "cantap", &mut script);
     std::io::Write::write_all(&mut std::io::stdout().lock(), &script)?;
     Ok(ExitCode::SUCCESS)
 }

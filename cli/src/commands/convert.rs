@@ -4,11 +4,11 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
 use anyhow::{Context, bail};
-use cantap::filter::Filter;
-use cantap::formats::{
+use cantap_formats::time_range::{TimePoint, TimeRange};
+use cantap_formats::{
     DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, create_writer,
 };
-use cantap::window::{TimePoint, Window};
+use cantap_trace::filter::Filter;
 
 use crate::input::ReadArgs;
 use crate::interrupt;
@@ -138,7 +138,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let failed = || format!("cannot write {}", shown(&args.output));
     let mut writer = create_writer(&args.output, &options).with_context(failed)?;
-    let mut window = Window::new(args.start, args.end);
+    let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
     // What came until an error is kept: the file is finished all the same.
@@ -179,7 +179,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Creating OUT empties it: if it is IN, the trace would be gone.
-fn refuse_same_file(input: &Path, output: &Path) -> anyhow::Result<()> {
+pub fn refuse_same_file(input: &Path, output: &Path) -> anyhow::Result<()> {
     if input.as_os_str() == "-" || output.as_os_str() == "-" {
         return Ok(());
     }

@@ -1,18 +1,21 @@
 //! `cantap decode`: a trace as signals.
 
 mod csv;
+mod decoded;
 mod json;
 mod text;
 
+pub use decoded::Seconds;
 pub use text::write_values;
 
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use cantap::signals::{Decoder, Message, SignalValue};
-use cantap::{TraceEvent, TraceRecord};
+use cantap::TraceEvent;
+use cantap_signals::Decoder;
 
+use self::decoded::Decoded;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
@@ -46,14 +49,6 @@ pub struct Args {
     json: bool,
     #[command(flatten)]
     read: ReadArgs,
-}
-
-/// A decoded frame, as the three outputs take it.
-struct Decoded<'a> {
-    record: &'a TraceRecord,
-    frame: &'a cantap::Frame,
-    message: &'a Message,
-    values: &'a [SignalValue],
 }
 
 /// What the summary says.
@@ -116,19 +111,4 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
         }
     }
     Ok(count)
-}
-
-/// Seconds with six decimals, or nine where the trace has them.
-pub struct Seconds(pub i64);
-
-impl std::fmt::Display for Seconds {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        let sign = if self.0 < 0 { "-" } else { "" };
-        let (seconds, ns) = (self.0.unsigned_abs() / 1_000_000_000, self.0.unsigned_abs() % 1_000_000_000);
-        if ns % 1000 == 0 {
-            write!(f, "{sign}{seconds}.{:06}", ns / 1000)
-        } else {
-            write!(f, "{sign}{seconds}.{ns:09}")
-        }
-    }
 }

@@ -3,11 +3,12 @@
 use std::io::Write;
 use std::process::ExitCode;
 
-use cantap::filter::Filter;
+use cantap::Channel;
 use cantap::wire::message::{Defaults, FrameKind};
-use cantap::{Address, Channel, Device};
+use cantap_trace::filter::Filter;
 use serde_json::{Value, json};
 
+use crate::address::Address;
 use crate::args;
 use crate::channel_args::{ChannelArgs, mode_name};
 
@@ -71,13 +72,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     match &args.action {
         Action::Save(save) => {
-            let device = Device::open(&save.device)?;
+            let device = save.device.open()?;
             save.open.configure(&device, save.channel.iter(), &save.filter)?;
             device.save_defaults()?;
             writeln!(out, "saved on the device")?;
         }
         Action::Show(show) => {
-            let device = Device::open(&show.device)?;
+            let device = show.device.open()?;
             let clock_hz = device.hello().can_clock_hz;
             let mut objects = Vec::new();
             for channel in Channel::ALL {
@@ -93,7 +94,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         }
         Action::Clear(clear) => {
-            Device::open(&clear.device)?.clear_defaults()?;
+            clear.device.open()?.clear_defaults()?;
             writeln!(out, "erased from the device")?;
         }
     }

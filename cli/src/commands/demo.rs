@@ -8,11 +8,11 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use cantap::device::{Link, Records};
-use cantap::formats::{Format, ReadOptions, TraceWriter, WriteOptions, create_writer, open_reader};
-use cantap::simbus::Frames;
-use cantap::virtual_device::{Options, SequenceCheck, start};
 use cantap::wire::CHANNELS;
 use cantap::{Channel, Device, TraceRecord};
+use cantap_formats::{Format, ReadOptions, TraceWriter, WriteOptions, create_writer, open_reader};
+use cantap_virtual::simbus::Frames;
+use cantap_virtual::{Options, SequenceCheck, start};
 use indicatif::{ProgressBar, ProgressStyle};
 
 use crate::args;

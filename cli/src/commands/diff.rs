@@ -4,7 +4,7 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use cantap::diff::{Changed, Difference, Key, Profile, compare};
+use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
 use crate::exit;

@@ -4,11 +4,13 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::bail;
+use cantap::device::Transmission;
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
-use cantap::{Address, Channel, Device, Frame, Id};
+use cantap::{Channel, Frame, Id, bits_on_bus};
 
+use crate::address::Address;
 use crate::channel_args::{self, ChannelArgs};
 use crate::interrupt;
 use crate::sending::Sending;
@@ -21,20 +23,24 @@ use crate::wrong::wrong;
                         at least. A full queue is always waited for, so cangen's -p and -i change nothing. When no frame leaves for a second, it \
                         ends and says why.\n\n\
                         Examples:\n  cantap gen -d virtual can0 -g 10 -I 42A -L 8 -D i -n 1000\n  \
-                        cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m\n  cantap gen -d virtual can1 -g 100 -c 8 -n 80"
+                        cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m\n  cantap gen -d /dev/ttyACM0 -b 1M both --saturate\n  cantap gen -d virtual can1 -g 100 -c 8 -n 80"
 )]
 pub struct Args {
     /// Where the device is: a serial port, or virtual.
     #[arg(short, long)]
     device: Address,
-    /// can0 or 1, can1 or 2.
-    #[arg(value_parser = channel_args::channel)]
-    channel: Channel,
+    /// can0 or 1, can1 or 2; or both.
+    #[arg(value_parser = channels)]
+    channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,
     /// Time from one frame to the next in milliseconds; 0 as fast as the bus takes them.
     #[arg(short, long, value_name = "MS", default_value_t = 200.0, value_parser = gap)]
     gap: f64,
+    /// Fill the bus: no gap, and frames without data, the most that a bus can carry, unless -L or -D says otherwise. Says at
+    /// the end how full it was.
+    #[arg(long, conflicts_with_all = ["gap", "burst"])]
+    saturate: bool,
     /// 29-bit identifiers.
     #[arg(short, long)]
     extended: bool,
@@ -83,6 +89,17 @@ pub struct Args {
     /// Print each frame that was sent.
     #[arg(short, long)]
     verbose: bool,
+}
+
+/// One channel, or both in turns.
+type Channels = heapless::Vec<Channel, CHANNELS>;
+
+fn channels(text: &str) -> Result<Channels, String> {
+    if text == "both" {
+        return Ok(Channel::ALL.into_iter().collect());
+    }
+    let channel = channel_args::channel(text).map_err(|error| format!("{error}, or both"))?;
+    Ok([channel].into_iter().collect())
 }
 
 /// Where a number comes from.
@@ -174,6 +191,7 @@ impl Generator<'_> {
         let lengths = if self.args.raw_dlc { 16 } else { 9 };
         let length = match (length, data) {
             (Some(values), _) => self.number(*values, lengths),
+            (None, Data::Varying(Values::Random)) if self.args.saturate => 0,
             (None, Data::Fixed(bytes)) => bytes.len() as u32,
             (None, Data::Varying(_)) => self.random.u32(..lengths),
         };
@@ -198,6 +216,51 @@ impl Generator<'_> {
     }
 }
 
+/// How full the buses were, from the first frame that was sent to the last that was seen to end.
+struct Filled {
+    bitrates_bps: [u32; CHANNELS],
+    frames: [u64; CHANNELS],
+    bits: [u64; CHANNELS],
+    span_ticks: [Option<(u64, u64)>; CHANNELS],
+}
+
+impl Filled {
+    const fn new(bitrates_bps: [u32; CHANNELS]) -> Self {
+        Self { bitrates_bps, frames: [0; CHANNELS], bits: [0; CHANNELS], span_ticks: [None; CHANNELS] }
+    }
+
+    fn add(&mut self, ends: &[Transmission]) {
+        for end in ends {
+            let Ok(frame) = &end.result else { continue };
+            let channel = end.channel.index();
+            match &mut self.span_ticks[channel] {
+                None => self.span_ticks[channel] = Some((end.ticks, end.ticks)),
+                Some((_, last)) => {
+                    *last = end.ticks;
+                    self.frames[channel] += 1;
+                    self.bits[channel] += u64::from(bits_on_bus(frame));
+                }
+            }
+        }
+    }
+
+    fn tell(&self, tick_hz: u32) {
+        for channel in Channel::ALL {
+            let index = channel.index();
+            let Some((first, last)) = self.span_ticks[index].filter(|(first, last)| first < last) else {
+                continue;
+            };
+            let seconds = (last - first) as f64 / f64::from(tick_hz);
+            let load_pct = self.bits[index] as f64 * 100.0 / (f64::from(self.bitrates_bps[index]) * seconds);
+            let frames_per_s = self.frames[index] as f64 / seconds;
+            eprintln!(
+                "cantap: channel {}: {frames_per_s:.0} frames/s, bus load {load_pct:.1} %",
+                channel.number()
+            );
+        }
+    }
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.fd || args.fd_error_state {
@@ -208,22 +271,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Err(wrong(reason));
     }
     interrupt::watch()?;
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     let mut bitrates_bps = [0; CHANNELS];
-    for (channel, config) in args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)? {
+    for (channel, config) in args.open.open(&device, args.channel.iter().copied(), Mode::Normal, None)? {
         bitrates_bps[channel.index()] = config.timing.bitrate_bps(device.hello().can_clock_hz);
     }
-    let gap = Duration::from_secs_f64(args.gap / 1e3);
+    let gap = Duration::from_secs_f64(if args.saturate { 0.0 } else { args.gap / 1e3 });
     // A trace of frames that all end at once, held apart by the gap.
     let pace = Pace { shortest_gap: gap, burst: args.burst, ignore_times: gap.is_zero(), ..Pace::default() };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut sending = Sending::new(&device, args.open.rescue(&device), !args.verbose);
+    let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
-    while args.frames.is_none_or(|frames| generator.count < frames) {
+    let mut filled = Filled::new(bitrates_bps);
+    let mut turns = args.channel.iter().cycle();
+    while args.frames.is_none_or(|frames| generator.count < frames)
+        && let Some(channel) = turns.next()
+    {
         let frame = generator.frame();
-        let mut goes_on =
-            |replay: &mut Replay<'_>| sending.goes_on(&replay.take_ended(), replay.oldest_due());
-        if !goes_on(&mut replay) || !replay.push(0, args.channel, frame, goes_on)? {
+        let mut goes_on = |replay: &mut Replay<'_>| {
+            let ends = replay.take_ended();
+            filled.add(&ends);
+            sending.goes_on(&ends, replay.oldest_due())
+        };
+        if !goes_on(&mut replay) || !replay.push(0, *channel, frame, goes_on)? {
             break;
         }
     }
@@ -234,6 +304,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let outcome = sending.outcome(asked)?;
     device.stop()?;
     eprintln!("cantap: {} frames sent", sending.sent());
+    if args.saturate {
+        filled.tell(device.hello().tick_hz);
+    }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
 }

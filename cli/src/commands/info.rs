@@ -4,7 +4,10 @@ use std::io::Write;
 use std::process::ExitCode;
 
 use cantap::wire::message::capability;
-use cantap::{Address, Device};
+
+use crate::address::Address;
+
+use crate::clock;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -29,7 +32,7 @@ const CAPABILITIES: [(u32, &str); 5] = [
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     let hello = device.hello();
     let [major, minor, patch] = hello.firmware;
     let firmware = format!("{major}.{minor}.{patch}");
@@ -54,6 +57,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             "filter_banks": hello.filter_banks,
             "capabilities": capabilities,
             "round_trip_us": round_trip_us,
+            "clock": clock::object(&device.clock()),
         });
         writeln!(out, "{object}")?;
     } else {
@@ -72,6 +76,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         writeln!(out, "filter banks    {}", hello.filter_banks)?;
         writeln!(out, "capabilities    {}", capabilities.join(", "))?;
         writeln!(out, "round trip      {round_trip_us:.0} us")?;
+        writeln!(out, "clock           {}", clock::line(&device.clock()))?;
     }
     Ok(ExitCode::SUCCESS)
 }

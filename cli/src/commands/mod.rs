@@ -1,5 +1,6 @@
 //! The subcommands. Each file has an `Args` for its command line and a `run`.
 
+pub mod align;
 pub mod autobaud;
 pub mod bits;
 pub mod capture;
@@ -17,6 +18,7 @@ pub mod monitor;
 pub mod plot;
 pub mod replay;
 pub mod search;
+pub mod selftest;
 pub mod send;
 pub mod stats;
 pub mod status;
@@ -42,6 +44,8 @@ pub enum Command {
     Convert(convert::Args),
     /// Show what two traces say differently: IDs, periods, lengths, bits.
     Diff(diff::Args),
+    /// Set traces of several recorders on one clock by the frames that they share.
+    Align(align::Args),
     /// Find frames in a trace by ID, data or a condition on signals.
     Search(search::Args),
     /// List every bit timing of a bit rate, what each is worth, and the one to choose.
@@ -63,6 +67,8 @@ pub enum Command {
     Virtual(virtual_device::Args),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
+    /// Test a board: everything that it can show by itself, and a report to send in.
+    Selftest(selftest::Args),
     /// Find a bus's bit rate by listening only.
     Autobaud(autobaud::Args),
     /// Send frames: now, periodically, or in reply.
@@ -82,8 +88,8 @@ pub enum Command {
 }
 
 impl Command {
-    /// Runs it.
-    pub fn run(self) -> anyhow::Result<ExitCode> {
+    /// Runs it. `line` describes the whole command.
+    pub fn run(self, line: clap::Command) -> anyhow::Result<ExitCode> {
         match self {
             Self::Bits(args) => bits::run(&args),
             Self::Monitor(args) => monitor::run(&args),
@@ -91,10 +97,11 @@ impl Command {
             Self::Stats(args) => stats::run(&args),
             Self::Convert(args) => convert::run(&args),
             Self::Diff(args) => diff::run(&args),
+            Self::Align(args) => align::run(&args),
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
-            Self::Completions(args) => completions::run(&args),
+            Self::Completions(args) => completions::run(&args, line),
             Self::Decode(args) => decode::run(&args),
             Self::Demo(args) => demo::run(&args),
             Self::Info(args) => info::run(&args),
@@ -102,6 +109,7 @@ impl Command {
             #[cfg(unix)]
             Self::Virtual(args) => virtual_device::run(&args),
             Self::Status(args) => status::run(&args),
+            Self::Selftest(args) => selftest::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),

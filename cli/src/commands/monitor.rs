@@ -7,11 +7,11 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context;
-use cantap::Address;
-use cantap::filter::Filter;
-use cantap::signals::Decoder;
 use cantap::wire::message::Mode;
+use cantap_signals::Decoder;
+use cantap_trace::filter::Filter;
 
+use crate::address::Address;
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -102,7 +102,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let open = channel_args(args, &profile, &mut complaints);
     if args.file.is_none() {
         open.timing.check_channels()?;
-        args.device.as_ref().map_or(Ok(()), Address::check)?;
     }
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
@@ -190,9 +189,9 @@ fn plan(args: &Args, profile: &Profile, open: ChannelArgs, complaints: &mut Vec<
         (Some(address), _) => address.clone(),
         (None, Some(text)) => text.parse().unwrap_or_else(|error| {
             complaints.push(format!("device {text}: {error}"));
-            Address::Virtual(String::new())
+            Address::of_virtual_device()
         }),
-        (None, None) => Address::Virtual(String::new()),
+        (None, None) => Address::of_virtual_device(),
     };
     let mut plan = Plan { address, channels: Vec::new(), open };
     match args.channel {

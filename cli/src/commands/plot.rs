@@ -7,11 +7,11 @@ use std::time::Duration;
 
 use anyhow::bail;
 use cantap::Id;
-use cantap::plot::{
+use cantap_analysis::plot::{
     DEFAULT_WIDTH, LoadCollector, MOST_CURVES, PictureFormat, Plot, SignalCollector, TextStyle,
     TimingCollector,
 };
-use cantap::stats::Options;
+use cantap_analysis::stats::Options;
 
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;

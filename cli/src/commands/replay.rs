@@ -9,8 +9,9 @@ use anyhow::{Context, bail};
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
-use cantap::{Address, Channel, Device, TraceEvent};
+use cantap::{Channel, Device, TraceEvent};
 
+use crate::address::Address;
 use crate::channel_args::{self, ChannelArgs};
 use crate::input::ReadArgs;
 use crate::sending::Sending;
@@ -152,7 +153,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else if args.interactive {
         bail!("standard input cannot bring both the trace and Enter; give a file with --interactive");
     }
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     let mut bitrates_bps = [0; CHANNELS];
     let mut buses =
         Buses { device: &device, closed: args.open.configs(&device, source.channels(), Mode::Normal)? };
@@ -170,7 +171,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ignore_times: args.ignore_times,
     };
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
-    let mut sending = Sending::new(&device, args.open.rescue(&device), !args.verbose);
+    let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
     let started = Instant::now();
     let Played { asked, left_out } = args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();

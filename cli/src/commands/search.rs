@@ -6,11 +6,11 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
-use cantap::condition::Condition;
-use cantap::formats::{TraceWriter, WriteOptions, create_writer};
-use cantap::search::{DataPattern, IdPattern, Search};
-use cantap::signals::{Decoder, SignalValue};
 use cantap::{TraceEvent, TraceRecord};
+use cantap_formats::{TraceWriter, WriteOptions, create_writer};
+use cantap_signals::condition::Condition;
+use cantap_signals::search::{DataPattern, IdPattern, Search};
+use cantap_signals::{Decoder, SignalValue};
 
 use super::decode;
 use crate::databases::DatabaseArgs;

@@ -6,15 +6,16 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use anyhow::bail;
-use cantap::filter::Filter;
 use cantap::periodic::{self, BadPeriodic, SHORTEST_PERIOD};
 use cantap::transmit::Stream;
 use cantap::wire::message::{
     DEVICE_TAG, Filter as HardwareFilter, FrameKind, Mode, Periodic, TRIGGER_TAG, Trigger,
 };
-use cantap::{Address, Channel, Device, Frame, Id, hw_filter, signals};
+use cantap::{Channel, Device, Frame, Id, hw_filter};
+use cantap_trace::filter::Filter;
 use modifiers::Modifiers;
 
+use crate::address::Address;
 use crate::channel_args::{self, ChannelArgs};
 use crate::databases::DatabaseArgs;
 use crate::sending::{LOOK_EVERY, Sending};
@@ -72,9 +73,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let triggers = args.triggers(&frames)?;
     let periodic = args.periodic(&frames)?;
     interrupt::watch()?;
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
-    let mut sending = Sending::new(&device, args.open.rescue(&device), args.quiet);
+    let mut sending = Sending::new(&device, args.open.rescue(), args.quiet);
     let asked = match (triggers, periodic) {
         (Some(triggers), _) => {
             let slots = device.hello().trigger_slots;
@@ -121,7 +122,7 @@ impl Args {
         let frame = |text: &String| {
             // A colon stands in no frame and in every message with values.
             if text.contains(':') && !text.contains('#') {
-                Ok(signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
+                Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = text.parse::<Frame>();
                 Ok(frame.map_err(|error| wrong(format!("'{text}' is no frame: {error}")))?)

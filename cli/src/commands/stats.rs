@@ -10,10 +10,10 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cantap::Address;
-use cantap::stats::{Options, PeakSummary, Statistics, Summary};
+use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
 
 use self::windows::Windows;
+use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::input::ReadArgs;
@@ -70,8 +70,9 @@ impl Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut statistics = Statistics::new(args.options())?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
+    let mut ended = Ok(());
     if let Some(address) = &args.device {
-        live::run(args, address, &mut statistics, &mut windows)?;
+        ended = live::run(args, address, &mut statistics, &mut windows);
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {
@@ -89,6 +90,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         bail!("name a file, or a device with -d");
     }
+    if statistics.channels().is_empty() {
+        // Nothing was heard: the reason is all there is to say.
+        ended?;
+        ended = Ok(());
+    }
     let summary = statistics.summary();
     // Its reader may have gone; that is an error as any other.
     let mut out = BufWriter::new(std::io::stdout().lock());
@@ -102,6 +108,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         out.write_all(table::hint(&summary, args.per_id).as_bytes())?;
     }
     out.flush()?;
+    ended?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -4,14 +4,15 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use cantap::wire::message::{ChannelStatus, Hello, Mode, RegisterSet, Status};
+use cantap::Channel;
+use cantap::wire::message::{ChannelStatus, Failures, Hello, Mode, RegisterSet, Status};
 use cantap::wire::record::{BusErrorKind, ErrorState};
-use cantap::{Address, Channel, Device};
 use serde_json::{Value, json};
 
+use crate::address::Address;
 use crate::channel_args::{ChannelArgs, mode_name};
 use crate::wrong::wrong;
-use crate::{args, interrupt};
+use crate::{args, clock, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -53,17 +54,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         ));
     }
     interrupt::watch()?;
-    let device = Device::open(&args.device)?;
+    let device = args.device.open()?;
     if let Some(time) = args.time {
         args.open.open(&device, args.channel.iter(), Mode::ListenOnly, Some(&[]))?;
-        let mut rescue = args.open.rescue(&device);
+        let mut rescue = args.open.rescue();
         let ends = Instant::now() + time;
         while Instant::now() < ends && !interrupt::requested() {
             std::thread::sleep(LOOK_EVERY.min(ends.saturating_duration_since(Instant::now())));
-            rescue.look()?;
+            rescue.look(&device)?;
         }
     }
     let status = device.status()?;
+    let failures = device.failures()?;
     let mut registers = Vec::new();
     if args.registers {
         for channel in Channel::ALL {
@@ -73,7 +75,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut out = std::io::stdout().lock();
     let uptime_s = status.ticks as f64 / f64::from(device.hello().tick_hz);
     if args.json {
-        let mut object = object(&status, uptime_s, device.hello());
+        let mut object = object(&status, &failures, uptime_s, device.hello());
+        object["clock"] = clock::object(&device.clock());
         for (channel, registers) in object["channels"].as_array_mut().into_iter().flatten().zip(&registers) {
             channel["registers"] = register_object(&registers.now);
             channel["registers_at_last_error"] =
@@ -83,6 +86,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         return Ok(ExitCode::SUCCESS);
     }
     writeln!(out, "uptime       {uptime_s:.1} s")?;
+    writeln!(out, "clock        {}", clock::line(&device.clock()))?;
     let tenths = |value: i16| format!("{:.1} C", f64::from(value) / 10.0);
     let unknown = || "not measured by this device".to_owned();
     writeln!(out, "temperature  {}", status.temperature_decicelsius.map_or_else(unknown, tenths))?;
@@ -96,6 +100,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         status.queue_high_water_bytes
     )?;
     writeln!(out, "bad requests {}", status.bad_requests)?;
+    writeln!(out, "failures     {}", in_words(&failures))?;
     for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
         let open = state.open.map_or("closed".to_owned(), |config| {
             let bitrate = config.timing.bitrate_bps(device.hello().can_clock_hz);
@@ -128,7 +133,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn object(status: &Status, uptime_s: f64, hello: &Hello) -> Value {
+/// How often the firmware failed since power-on, and why last.
+fn in_words(failures: &Failures) -> String {
+    match failures.count {
+        0 => "none since power-on".to_owned(),
+        1 => format!("1 since power-on: {}", failures.last),
+        count => format!("{count} since power-on, the last: {}", failures.last),
+    }
+}
+
+fn object(status: &Status, failures: &Failures, uptime_s: f64, hello: &Hello) -> Value {
     let channels: Vec<Value> = Channel::ALL
         .into_iter()
         .zip(&status.channels)
@@ -142,6 +156,8 @@ fn object(status: &Status, uptime_s: f64, hello: &Hello) -> Value {
         "queue_size_bytes": hello.queue_bytes,
         "queue_high_water_bytes": status.queue_high_water_bytes,
         "bad_requests": status.bad_requests,
+        "failures": failures.count,
+        "last_failure": (failures.count > 0).then_some(failures.last.as_str()),
         "channels": channels,
     })
 }
@@ -203,5 +219,23 @@ const fn error_name(kind: BusErrorKind) -> &'static str {
         BusErrorKind::BitRecessive => "bit recessive",
         BusErrorKind::BitDominant => "bit dominant",
         BusErrorKind::Crc => "CRC",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn failures_are_told_with_the_last_ones_words() {
+        let last = "panicked at src/a.rs:7:5: no";
+        for (count, words) in [
+            (0, "none since power-on".to_owned()),
+            (1, format!("1 since power-on: {last}")),
+            (2, format!("2 since power-on, the last: {last}")),
+        ] {
+            let last = if count > 0 { last } else { "" };
+            assert_eq!(in_words(&Failures { count, last: last.try_into().unwrap() }), words);
+        }
     }
 }

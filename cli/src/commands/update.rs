@@ -1,17 +1,20 @@
 //! `cantap update`: a firmware onto the board, through the chip's own USB bootloader.
 
-use std::io::{ErrorKind, Write};
+use std::io::{ErrorKind, IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 use anyhow::{Context, bail};
-use cantap::{Address, Device};
+
+use crate::address::Address;
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(
     after_help = "FILE is the .bin that `cargo xtask dist` or a release provides. The device leaves its \
-                        firmware for the chip's own USB bootloader; `dfu-util` writes the file, if it is installed."
+                        firmware for the chip's own USB bootloader; `dfu-util` writes the file, if it is installed.\n\n\
+                        The bootloader listens on CAN, too. Where it could drive channel 2's bus, unplug channel 2 first: the command \
+                        says so, and asks if it is run from a terminal."
 )]
 pub struct Args {
     /// Where the device is: a serial port.
@@ -19,6 +22,9 @@ pub struct Args {
     device: Address,
     /// The firmware, as a raw image for address 0x08000000.
     file: PathBuf,
+    /// Do not ask whether channel 2 is unplugged.
+    #[arg(short, long)]
+    yes: bool,
 }
 
 /// Where an STM32's flash begins.
@@ -33,7 +39,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let file = args.file.display();
     let image = std::fs::read(&args.file).with_context(|| format!("cannot read '{file}'; check its name"))?;
     check_image(&image).with_context(|| format!("'{file}'"))?;
-    Device::open(&args.device)?.bootloader()?;
+    let device = args.device.open()?;
+    if drives_channel_2(&device.hello().board) && !args.yes && !is_unplugged()? {
+        bail!("nothing was done; unplug channel 2 and run this again");
+    }
+    device.bootloader()?;
     let address = format!("0x{FLASH_START:08X}:leave");
     let arguments = ["-d", DFU_ID, "-a", "0", "-s", &address, "-w", "-D"];
     let line = || format!("dfu-util {} {}", arguments.join(" "), quoted(&args.file));
@@ -56,6 +66,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Ok(ExitCode::SUCCESS)
         }
     }
+}
+
+/// Whether the ROM bootloader's CAN pins (PB5 and PB13, AN2606) are channel 2's, as on every board that does not keep them apart
+/// (`docs/wiring.md`).
+fn drives_channel_2(board: &str) -> bool {
+    !matches!(board, "olimex-p405" | "virtual")
+}
+
+/// Says that channel 2 must be unplugged, and asks whether it is where somebody can answer.
+fn is_unplugged() -> anyhow::Result<bool> {
+    let mut err = std::io::stderr();
+    writeln!(
+        err,
+        "Unplug channel 2 from its bus: on this board the chip's bootloader may drive it, and takes it for the way to be programmed."
+    )?;
+    if !std::io::stdin().is_terminal() {
+        return Ok(true);
+    }
+    write!(err, "Is it unplugged? [y/N] ")?;
+    err.flush()?;
+    let mut answer = String::new();
+    std::io::stdin().read_line(&mut answer)?;
+    Ok(matches!(answer.trim(), "y" | "Y" | "yes"))
 }
 
 /// A file's name for a shell.
@@ -87,6 +120,15 @@ mod tests {
     #[test]
     fn a_file_name_with_a_quote_can_be_pasted_into_a_shell() {
         assert_eq!(quoted(Path::new("it's.bin")), r"'it'\''s.bin'");
+    }
+
+    #[test]
+    fn channel_2_is_asked_for_where_the_bootloader_may_drive_it() {
+        for (board, asked) in
+            [("olimex-p405", false), ("virtual", false), ("feather-f405", true), ("stm32f4-discovery", true)]
+        {
+            assert_eq!(drives_channel_2(board), asked, "{board}");
+        }
     }
 
     #[test]

@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cantap::virtual_device::{Options, open_terminal};
+use cantap_virtual::{Options, open_terminal};
 
 use crate::interrupt;
 
@@ -22,6 +22,7 @@ use crate::interrupt;
                         seed=N           another sequence of frames (1)\n  \
                         settings=FILE    where the device keeps what it saves, over a power cycle\n  \
                         pace=real|fast   real time, or as fast as the host reads (real)\n  \
+                        ppm=N            how much too fast its crystal is, in parts per million (0)\n  \
                         serial=NAME      the serial number that it tells (VIRTUAL)\n  \
                         log=FILE         replay a trace file at its own times; must come last\n\n\
                         The same options follow `virtual:` wherever a device is asked for.\n\n\

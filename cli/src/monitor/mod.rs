@@ -2,6 +2,7 @@
 //! depend on either.
 
 pub mod app;
+mod event_text;
 mod keyboard;
 pub mod model;
 pub mod picture;

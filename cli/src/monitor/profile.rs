@@ -2,8 +2,7 @@
 
 use std::path::Path;
 
-use super::app::View;
-use super::views::fixed::Column;
+use super::app::{Column, View};
 
 /// A profile as it is written. Every key may be left out; the command line goes before the profile.
 #[derive(Clone, Debug, Default, PartialEq, Eq, serde::Deserialize)]

@@ -3,13 +3,14 @@
 use std::path::{Path, PathBuf};
 
 use cantap::TraceRecord;
-use cantap::condition::Condition;
-use cantap::formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_signals::condition::Condition;
 
-use cantap::signals::Decoder;
-use cantap::trigger::{Trigger, Window};
+use cantap_signals::Decoder;
+use cantap_signals::trigger::{Trigger, Window};
 
 use super::model::Recording;
+use crate::advice;
 
 /// What is kept around an event where a condition is given.
 const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, once: false };
@@ -43,12 +44,13 @@ impl Recorder {
             None => None,
             Some(condition) => {
                 let condition = Condition::new(condition, decoder)
-                    .map_err(|error| anyhow::anyhow!("nothing is recorded: {error}"))?;
+                    .map_err(|error| anyhow::anyhow!("nothing is recorded: {}", advice::told(&error)))?;
                 Some(Trigger::new(condition, WINDOW))
             }
         };
-        let writer = create_writer(path, &WriteOptions::default())
-            .map_err(|error| anyhow::anyhow!("cannot record to {}: {error}", path.display()))?;
+        let writer = create_writer(path, &WriteOptions::default()).map_err(|error| {
+            anyhow::anyhow!("cannot record to {}: {}", path.display(), advice::told(&error))
+        })?;
         Ok(Self { path: path.to_owned(), writer, records: 0, since_ns: 0, trigger })
     }
 

@@ -8,7 +8,7 @@
 
 use cantap_wire::{BitTiming, Frame};
 
-use crate::bits::FrameBits;
+use cantap_trace::bits::FrameBits;
 
 /// Relative step in which rates are tried.
 const STEP: f64 = 0.000_5;
@@ -157,7 +157,7 @@ fn levels(frame: &Frame) -> Vec<bool> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bits::{INTERMISSION_BITS, bits_on_bus};
+    use cantap_trace::bits::{INTERMISSION_BITS, bits_on_bus};
 
     const CLOCK_HZ: u32 = 36_000_000;
 

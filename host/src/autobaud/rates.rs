@@ -4,7 +4,15 @@ use cantap_wire::BitTiming;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
 use super::hearing::Bounds;
-use super::{COMMON_BPS, SAME};
+
+/// Bit rates in use, in bit/s, those of CiA and of vehicles, the likeliest first.
+pub const COMMON_BPS: [u32; 14] = [
+    500_000, 250_000, 125_000, 1_000_000, 100_000, 50_000, 83_333, 33_333, 800_000, 20_000, 10_000, 5_000,
+    95_238, 62_500,
+];
+
+/// Rates nearer than this cannot be told apart by listening, and need not be.
+pub(super) const SAME: f64 = 0.005;
 
 /// The scan's step: near enough that one of two neighbours is heard.
 const SCAN_STEP: f64 = 1.007;

@@ -1,6 +1,8 @@
 //! What a device can be asked, one method each.
 
-use cantap_wire::message::{ChannelConfig, Defaults, Filter, Periodic, Registers, Status, Trigger, TxFrame};
+use cantap_wire::message::{
+    ChannelConfig, Defaults, Failures, Filter, Periodic, Registers, Status, Trigger, TxFrame,
+};
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
 use super::{Device, DeviceError};
@@ -10,6 +12,14 @@ impl Device {
     pub fn status(&self) -> Result<Status, DeviceError> {
         match self.request(Command::Status)? {
             Reply::Status(status) => Ok(status),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// How often the firmware failed since the device got its power, and why last.
+    pub fn failures(&self) -> Result<Failures, DeviceError> {
+        match self.request(Command::Failures)? {
+            Reply::Failures(failures) => Ok(failures),
             _ => Err(DeviceError::WrongReply),
         }
     }
@@ -24,9 +34,12 @@ impl Device {
 
     /// Replaces all filters of a closed channel. Returns the hardware banks that it uses and could use.
     pub fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<(u8, u8), DeviceError> {
-        let filters = heapless::Vec::from_slice(filters).map_err(|_| DeviceError::RequestTooLong)?;
-        match self.request(Command::SetFilters { channel, filters })? {
-            Reply::Filters { banks_used, banks_total } => Ok((banks_used, banks_total)),
+        let list = heapless::Vec::from_slice(filters).map_err(|_| DeviceError::RequestTooLong)?;
+        match self.request(Command::SetFilters { channel, filters: list })? {
+            Reply::Filters { banks_used, banks_total } => {
+                self.settings().filters[channel.index()] = Some(filters.to_vec());
+                Ok((banks_used, banks_total))
+            }
             _ => Err(DeviceError::WrongReply),
         }
     }

@@ -1,6 +1,7 @@
-//! What can go wrong with a device, in sentences that say what to do next.
+//! What can go wrong with a device.
 
-use std::io;
+use std::time::Duration;
+use std::{fmt, io};
 
 use cantap_wire::message::{MAX_FILTERS, MAX_SEND, Refusal};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS, NoTiming};
@@ -8,25 +9,10 @@ use cantap_wire::{Channel, PROTOCOL_VERSION};
 
 /// Why a device could not be opened or used.
 #[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
 pub enum DeviceError {
-    /// The address is not one.
-    #[error("'{address}' is not a device address: {reason}")]
-    BadAddress {
-        /// As it was given.
-        address: String,
-        /// What is wrong with it and what would be right.
-        reason: String,
-    },
-    /// The emulated board does not come up.
-    #[error("the emulated board at '{address}' does not start: {reason}")]
-    Emulation {
-        /// As it was given.
-        address: String,
-        /// What the emulator says.
-        reason: String,
-    },
     /// There is nothing at the address.
-    #[error("there is no device at '{address}'; `cantap list` shows what is connected")]
+    #[error("there is no device at '{address}'")]
     NotFound {
         /// As it was given.
         address: String,
@@ -47,18 +33,15 @@ pub enum DeviceError {
         address: String,
     },
     /// The port cannot be opened for another reason.
-    #[error("'{address}' cannot be opened as a serial port: {reason}; check the address with `cantap list`")]
+    #[error("'{address}' cannot be opened as a serial port: {source}")]
     Open {
         /// As it was given.
         address: String,
-        /// The system's message.
-        reason: String,
+        /// What the system says.
+        source: Box<dyn std::error::Error + Send + Sync>,
     },
     /// It does not answer, or not in our language.
-    #[error(
-        "'{address}' does not answer as a cantap device; check that it is one (`cantap list`), \
-         then unplug it and plug it in again"
-    )]
+    #[error("'{address}' does not answer as a cantap device")]
     NotCantap {
         /// As it was given.
         address: String,
@@ -91,12 +74,54 @@ pub enum DeviceError {
     #[error("the request is too long; give at most {MAX_FILTERS} filters or {MAX_SEND} frames at once")]
     RequestTooLong,
     /// The port is gone: unplugged, reset, or its other end closed.
-    #[error("the device at '{address}' vanished ({reason}); plug it in again and restart the capture")]
+    #[error("the device at '{address}' vanished ({reason})")]
     Vanished {
         /// As it was given.
         address: String,
         /// The system's message.
         reason: String,
+    },
+    /// The port is there, and nothing is answered any more.
+    #[error("the device at '{address}' has answered nothing for {seconds:.1} s")]
+    Silent {
+        /// As it was given.
+        address: String,
+        /// For how long, in seconds.
+        seconds: f32,
+    },
+    /// The session is over, and what was captured since went nowhere.
+    #[error("the session with the device at '{address}' has ended: {reason}")]
+    SessionEnded {
+        /// As it was given.
+        address: String,
+        /// How it shows.
+        reason: SessionOver,
+    },
+    /// It was not there when the capture ended.
+    #[error("the device at '{address}' was not there at the end: {reason}")]
+    StillGone {
+        /// As it was given.
+        address: String,
+        /// What was wrong with it last.
+        reason: String,
+    },
+    /// The capture could not be ended as it should be.
+    #[error(
+        "the capture from '{address}' ended without the device's last word, and frames may be missing at its end: {reason}"
+    )]
+    BadEnd {
+        /// As it was given.
+        address: String,
+        /// What was wrong.
+        reason: String,
+    },
+    /// Another board is at the address, on which what was set up before cannot be set up again.
+    #[error("another board is at '{address}' now ({name}), and its clock is another; start again with it")]
+    OtherClock {
+        /// As it was given.
+        address: String,
+        /// Its name and serial number.
+        name: String,
     },
     /// The bit rate cannot be set.
     #[error("{}", no_timing(*bitrate_bps, reason))]
@@ -107,30 +132,71 @@ pub enum DeviceError {
         reason: NoTiming,
     },
     /// The device has fewer channels.
-    #[error("the device has no channel {}; choose one it has with -c", .channel.number())]
+    #[error("the device has no channel {}", .channel.number())]
     NoChannel {
         /// What was asked for.
         channel: Channel,
     },
-    /// A file that the device needs cannot be read.
-    #[error("'{path}' cannot be read: {source}; check its name and permissions")]
-    File {
-        /// Its name.
-        path: String,
-        /// The system's message.
-        source: io::Error,
-    },
-    /// This build cannot do it.
-    #[error("this build of cantap has no support for '{address}'; build it with the feature `{feature}`")]
-    NotBuilt {
-        /// As it was given.
-        address: String,
-        /// What is missing.
-        feature: &'static str,
-    },
     /// A thread could not be started.
     #[error("the system refused a thread: {0}; close other programs and try again")]
-    Thread(io::Error),
+    Thread(#[source] io::Error),
+}
+
+/// How it shows that a session is over.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum SessionOver {
+    /// The device says that the computer suspended it.
+    Suspended,
+    /// The device refuses requests for want of one.
+    Refused,
+    /// Another program greets the device on our port.
+    Greeted,
+    /// The stream begins anew.
+    StreamWentBack,
+}
+
+impl DeviceError {
+    /// Whether it is the connection that fails, and not what was asked for.
+    pub const fn is_of_the_connection(&self) -> bool {
+        matches!(
+            self,
+            Self::Vanished { .. } | Self::Silent { .. } | Self::SessionEnded { .. } | Self::Timeout { .. }
+        ) || matches!(self, Self::Refused { refusal: Refusal::NoSession })
+    }
+}
+
+impl fmt::Display for SessionOver {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Suspended => "this computer put the device to sleep, as when it sleeps itself",
+            Self::Refused => {
+                "this computer slept, or the device was restarted, or another program took it over"
+            }
+            Self::Greeted => "another program took it over; close that program",
+            Self::StreamWentBack => {
+                "its stream began anew, because another program took it over or it was restarted"
+            }
+        })
+    }
+}
+
+/// Why a connection is of no use any more; kept to be told to everybody who asks for something.
+#[derive(Clone, Debug)]
+pub(super) enum Gone {
+    Vanished(String),
+    Silent(Duration),
+    Ended(SessionOver),
+}
+
+impl Gone {
+    pub fn error(&self, address: &str) -> DeviceError {
+        let address = address.to_owned();
+        match self {
+            Self::Vanished(reason) => DeviceError::Vanished { address, reason: reason.clone() },
+            Self::Silent(time) => DeviceError::Silent { address, seconds: time.as_secs_f32() },
+            Self::Ended(reason) => DeviceError::SessionEnded { address, reason: *reason },
+        }
+    }
 }
 
 fn older_side(device: u16) -> &'static str {
@@ -175,9 +241,9 @@ fn sentence(refusal: Refusal) -> String {
             );
         }
         Refusal::Malformed => "it could not read the request; update the firmware and this program",
-        Refusal::NoSession => "another program took it over; close that program and connect again",
-        Refusal::Unsupported => "it cannot do that; `cantap info` shows what it can",
-        Refusal::BadTiming => "the bit timing is outside the controller's range; see `cantap timing`",
+        Refusal::NoSession => "it knows of no session; connect again",
+        Refusal::Unsupported => "it cannot do that",
+        Refusal::BadTiming => "the bit timing is outside the controller's range",
         Refusal::BadId => {
             "an identifier is too large; 7FF is the last standard one, 1FFFFFFF the last extended one"
         }
@@ -188,10 +254,10 @@ fn sentence(refusal: Refusal) -> String {
         Refusal::BadEntry => {
             "a period is too short or too long, or a modifier lies outside the frame's data; change it"
         }
-        Refusal::BadSlot => "it has no such table entry; `cantap info` shows how many there are",
+        Refusal::BadSlot => "it has no such table entry",
         Refusal::ChannelOpen => "the channel is open; close it first",
         Refusal::ChannelClosed => "the channel is closed; open it first",
-        Refusal::ListenOnly => "the channel only listens; open it in normal mode (--mode normal) to send",
+        Refusal::ListenOnly => "the channel only listens",
         Refusal::WouldDisturb => "that would disturb the other channel; close that one first",
         Refusal::TooFarAhead => "the target time is too far ahead; send it later",
         Refusal::Hardware => {

@@ -1,12 +1,14 @@
 //! Bytes in, trace records out: decodes a device's stream, tightens stamps, maps them to UTC and counts.
 //! No threads, no I/O: the reader thread drives it, and so do tests and the benchmark.
 
+use std::ops::Add;
 use std::time::Instant;
 
+use cantap_wire::message::EndReason;
 use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
-use cantap_wire::{CHANNELS, Channel, Decoded, Decoder, Frame, Reply, Response};
+use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Frame, Reply, Response};
 
-use super::clock::{ClockMap, UtcClock};
+use super::clock::{ClockMap, SofMark, Ticks, UtcClock};
 use super::stamps::{BitLengths, tighten};
 use crate::{Direction, TraceEvent, TraceRecord};
 
@@ -51,6 +53,32 @@ pub struct Counters {
     pub corrupt: u64,
 }
 
+impl Add for ChannelCounters {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            received: self.received + other.received,
+            lost_controller: self.lost_controller + other.lost_controller,
+            lost_queue: self.lost_queue + other.lost_queue,
+            lost_link: self.lost_link + other.lost_link,
+            lost_host: self.lost_host + other.lost_host,
+        }
+    }
+}
+
+impl Add for Counters {
+    type Output = Self;
+
+    fn add(self, other: Self) -> Self {
+        Self {
+            channels: std::array::from_fn(|channel| self.channels[channel] + other.channels[channel]),
+            bytes: self.bytes + other.bytes,
+            corrupt: self.corrupt + other.corrupt,
+        }
+    }
+}
+
 /// How a transmission ended.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Transmission {
@@ -76,6 +104,15 @@ pub enum Notice {
     OtherProtocol(u16),
     /// Nothing more follows of this channel.
     Stopped(Channel),
+    /// The stream has begun anew: the session is not ours any more.
+    WentBack,
+    /// The device has ended the session.
+    Ended {
+        /// From when on nothing was captured, in UTC nanoseconds since the Unix epoch.
+        time_ns: i64,
+        /// Why.
+        reason: EndReason,
+    },
     /// A transmission ended.
     Transmission(Transmission),
 }
@@ -90,6 +127,8 @@ pub struct Intake {
     /// The last record's time.
     last_ns: i64,
     counters: Counters,
+    /// Device time of the latest record, in ticks.
+    latest_ticks: u64,
     /// `Hello` was answered; what came before belongs to somebody else's session.
     in_session: bool,
 }
@@ -106,6 +145,7 @@ impl Intake {
             utc,
             last_ns: i64::MIN,
             counters: Counters::default(),
+            latest_ticks: 0,
             in_session: false,
         }
     }
@@ -113,9 +153,10 @@ impl Intake {
     /// Takes at most [`PIECE_BYTES`] (more is fine, and slower), reports notices, and returns the records, to
     /// be taken out of the vector.
     pub fn push(&mut self, bytes: &[u8], mut notice: impl FnMut(Notice)) -> &mut Vec<TraceRecord> {
-        let Self { decoder, records, counters, clock, in_session, .. } = self;
-        let mut hello = None;
+        let Self { decoder, records, counters, clock, in_session, lengths, last_ns, utc, latest_ticks } =
+            self;
         let mut last_ticks = None;
+        let mut ended = None;
         counters.bytes += bytes.len() as u64;
         decoder.push(bytes, |decoded| match decoded {
             Decoded::Record { .. } | Decoded::BatchesLost { .. } if !*in_session => {}
@@ -145,32 +186,39 @@ impl Intake {
                 }
             }
             Decoded::Response(response) => {
-                if let Ok(Reply::Hello(answer)) = &response.result {
-                    hello = Some(answer.tick_hz);
+                // A later one was asked for by somebody else, or twice by us before the first was answered.
+                if let (Ok(Reply::Hello(answer)), false) = (&response.result, *in_session) {
+                    // What stands before belongs to a session that is over.
+                    *in_session = true;
+                    records.clear();
+                    last_ticks = None;
+                    *latest_ticks = 0;
+                    *counters = Counters::default();
+                    *lengths = BitLengths::default();
+                    *last_ns = i64::MIN;
+                    *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
                 }
                 notice(Notice::Response(response.clone()));
             }
-            Decoded::Corrupt(_) => counters.corrupt += 1,
+            Decoded::Ended { ticks, reason } if *in_session => {
+                *in_session = false;
+                ended = Some((ticks, reason));
+            }
+            Decoded::Ended { .. } => {}
+            Decoded::Corrupt(corruption) => {
+                counters.corrupt += 1;
+                if *in_session && matches!(corruption, Corruption::OutOfOrder { .. }) {
+                    notice(Notice::WentBack);
+                }
+            }
             Decoded::OtherProtocol(version) => notice(Notice::OtherProtocol(version)),
         });
-        if let Some(tick_hz) = hello {
-            self.begin_session(tick_hz);
-        } else {
-            self.place_in_time();
+        *latest_ticks = (*latest_ticks).max(last_ticks.unwrap_or(0));
+        self.place_in_time();
+        if let Some((ticks, reason)) = ended {
+            notice(Notice::Ended { time_ns: self.clock.utc(Ticks(ticks)).0, reason });
         }
         &mut self.records
-    }
-
-    /// A device that answered `Hello` sends nothing more until a channel is opened: what stands before belongs
-    /// to a session that is over.
-    fn begin_session(&mut self, tick_hz: u32) {
-        self.decoder.restart();
-        self.records.clear();
-        self.counters = Counters::default();
-        self.clock = ClockMap::new(tick_hz, self.utc.at(Instant::now()));
-        self.last_ns = i64::MIN;
-        self.lengths = BitLengths::default();
-        self.in_session = true;
     }
 
     /// Tightens the new records, maps them to UTC and puts them in order. A channel whose stamps were moved
@@ -180,7 +228,7 @@ impl Intake {
         let mut sorted = true;
         let mut previous = self.last_ns;
         for record in &mut self.records {
-            record.time_ns = self.clock.utc_ns(record.time_ns as u64).max(self.last_ns);
+            record.time_ns = self.clock.utc(Ticks(record.time_ns as u64)).0.max(self.last_ns);
             sorted &= record.time_ns >= previous;
             previous = record.time_ns;
         }
@@ -204,7 +252,7 @@ impl Intake {
     }
 
     /// Adds a round trip of the clock.
-    pub fn add_time(&mut self, ticks: u64, asked: Instant, answered: Instant) {
+    pub fn add_time(&mut self, ticks: Ticks, asked: Instant, answered: Instant) {
         self.clock.add(ticks, self.utc.at(asked), self.utc.at(answered));
     }
 
@@ -221,6 +269,11 @@ impl Intake {
     /// Whether `Hello` was answered.
     pub const fn is_in_session(&self) -> bool {
         self.in_session
+    }
+
+    /// Device time of the latest record, in ticks.
+    pub const fn latest_ticks(&self) -> u64 {
+        self.latest_ticks
     }
 
     /// What was counted.
@@ -271,7 +324,7 @@ fn on_event(
     event: Event,
     ticks: u64,
     counters: &mut Counters,
-    clock: &ClockMap,
+    clock: &mut ClockMap,
     records: &mut Vec<TraceRecord>,
     notice: &mut impl FnMut(Notice),
 ) {
@@ -294,17 +347,20 @@ fn on_event(
             (channel, TraceEvent::State { state, counters: Some((tec, rec)) })
         }
         Event::Transmitted { channel, tag, frame } => {
-            let time_ns = clock.utc_ns(ticks);
+            let time_ns = clock.utc(Ticks(ticks)).0;
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
             (channel, TraceEvent::Frame { frame, direction: Direction::Tx, late: false })
         }
         Event::TransmitFailed { channel, tag, reason } => {
-            let time_ns = clock.utc_ns(ticks);
+            let time_ns = clock.utc(Ticks(ticks)).0;
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Err(reason) }));
             (channel, TraceEvent::TransmitFailed { tag, reason })
         }
         Event::Stopped { channel } => return notice(Notice::Stopped(channel)),
-        Event::Started { .. } | Event::TimeMark => return,
+        Event::SofMark { frame, doubled } => {
+            return clock.mark(SofMark { frame, at: Ticks(ticks), doubled });
+        }
+        Event::Started { .. } => return,
     };
     records.push(TraceRecord { time_ns: ticks as i64, channel: channel.number(), event });
 }

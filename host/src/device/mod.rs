@@ -1,10 +1,10 @@
 //! A device: opening it, asking it, and the records it captures.
 //!
-//! [`Device::open`] connects, [`Device::records`] hands out what is captured, the other methods are requests.
+//! [`Device::open`] connects to a serial port, [`Device::over`] to whatever makes a [`Link`]; [`Device::records`] hands out
+//! what is captured, the other methods are requests.
 //! A thread of its own reads the port, so that a slow program loses nothing as long as the buffer lasts, and
 //! is told exactly what it lost after that.
 
-mod address;
 mod buffer;
 mod clock;
 mod commands;
@@ -13,34 +13,37 @@ mod intake;
 mod link;
 mod pipe;
 mod reader;
+mod reconnect;
 #[cfg(feature = "serial")]
 mod serial;
 mod stamps;
+mod watch;
 
-use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::sync::mpsc::{Receiver, Sender, sync_channel};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap_wire::message::{ChannelConfig, Status};
+use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
 use cantap_wire::record::LossStage;
-use cantap_wire::{BitTiming, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
+use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
-pub use address::Address;
-pub use clock::{ClockMap, ClockReport, UtcClock};
-pub use error::DeviceError;
+pub use clock::{
+    ClockMap, ClockReport, ClockSource, CommonClock, FrameClock, FrameDoubt, FrameNs, NotCommon, SofMark,
+    Ticks, UtcClock, UtcNs,
+};
 pub(crate) use error::no_timing;
+pub use error::{DeviceError, SessionOver};
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
 pub use link::Link;
 pub use pipe::{PipeReader, PipeWriter, pipe};
+pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
-pub use serial::{Board, list};
+pub use serial::{Board, list, port_of};
 pub use stamps::{BitLengths, tighten};
 
 use crate::TraceRecord;
-#[cfg(all(test, feature = "virtual"))]
-pub(crate) use reader::encode;
 use reader::{Answer, Order, Shared};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
@@ -53,8 +56,8 @@ const HELLO_TRIES: u32 = 3;
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 /// Round trips that set the clock at the start.
 const CLOCK_ROUNDS: u32 = 8;
-/// A closing channel is given up when nothing arrives for so long.
-const DRAIN_TIMEOUT: Duration = Duration::from_secs(2);
+/// A closing channel's last records are given up when none has come for so long.
+const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 /// Transmissions that a subscriber may leave waiting.
 const TRANSMISSIONS: usize = 65_536;
 
@@ -64,12 +67,21 @@ pub struct Device {
     orders: Sender<Order>,
     hello: Hello,
     thread: Option<JoinHandle<()>>,
+    settings: Mutex<Settings>,
+}
+
+/// What the channels were given in this session, to be given to them again in the next.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct Settings {
+    filters: [Option<Vec<Filter>>; CHANNELS],
+    open: [Option<ChannelConfig>; CHANNELS],
 }
 
 impl Device {
-    /// Connects to the device at an address.
-    pub fn open(address: &Address) -> Result<Self, DeviceError> {
-        Self::over(connect(address)?, &address.to_string())
+    /// Connects to the device on a serial port, by its path or name: `/dev/ttyACM0`, `COM5`.
+    #[cfg(feature = "serial")]
+    pub fn open(port: &str) -> Result<Self, DeviceError> {
+        Self::over(serial::open(port)?, port)
     }
 
     /// Talks to the device at the other end of a byte stream; `name` is what messages call it.
@@ -86,7 +98,8 @@ impl Device {
             })
             .map_err(DeviceError::Thread)?;
         // Its end stops the thread, whatever happens from here on.
-        let mut device = Self { shared, orders, hello: no_hello(), thread: Some(thread) };
+        let settings = Mutex::default();
+        let mut device = Self { shared, orders, hello: no_hello(), thread: Some(thread), settings };
         device.hello = device.shake_hands()?;
         for _ in 0..CLOCK_ROUNDS {
             device.time()?;
@@ -166,6 +179,7 @@ impl Device {
         match self.request(Command::Open { channel, config })? {
             Reply::Opened(applied) => {
                 self.set_bit_length(channel, &applied);
+                self.settings().open[channel.index()] = Some(applied);
                 Ok(applied)
             }
             _ => Err(DeviceError::WrongReply),
@@ -187,33 +201,63 @@ impl Device {
         self.open_channel(channel, Some(ChannelConfig::listen_only(timing)))
     }
 
+    /// Opens a channel that takes part in the bus, at a bit rate: it acknowledges, and may send.
+    pub fn join(&self, channel: Channel, bitrate_bps: u32) -> Result<ChannelConfig, DeviceError> {
+        let timing = self.timing(bitrate_bps)?;
+        let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing) };
+        self.open_channel(channel, Some(config))
+    }
+
+    fn settings(&self) -> MutexGuard<'_, Settings> {
+        self.settings.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The channels that are open, and how they were opened.
+    pub fn open_channels(&self) -> Vec<(Channel, ChannelConfig)> {
+        let open = self.settings().open;
+        Channel::ALL.into_iter().filter_map(|channel| Some((channel, open[channel.index()]?))).collect()
+    }
+
     /// Closes a channel and waits until everything it captured has arrived.
     pub fn close_channel(&self, channel: Channel) -> Result<(), DeviceError> {
         let before = self.shared.published();
         let was_open = self.status()?.channels[channel.index()].open.is_some();
         self.done(Command::Close { channel })?;
-        let mut seen = before;
+        // The record that says so is in the device's queue by now, so nothing of a later time is in front of it.
+        let closed_at = self.time()?;
+        let mut seen = self.shared.published();
         let mut quiet = Instant::now();
         while was_open && seen.stopped[channel.index()] == before.stopped[channel.index()] {
             if let Some(gone) = self.shared.gone() {
                 return Err(gone);
             }
             let now = self.shared.wait_for_news(&seen, DRAIN_TIMEOUT / 4);
-            if now.reads != seen.reads {
+            if now.latest_ticks != seen.latest_ticks {
                 quiet = Instant::now();
             }
             seen = now;
-            if quiet.elapsed() > DRAIN_TIMEOUT {
+            if seen.latest_ticks > closed_at || quiet.elapsed() > DRAIN_TIMEOUT {
                 // The record itself was lost on the way; the device's counters tell the rest.
                 break;
             }
         }
+        self.settings().open[channel.index()] = None;
         Ok(())
     }
 
     /// Closes both channels, waits for everything they captured, accounts for what the link lost at the very
-    /// end, and ends the stream of records. Returns the device's last status.
+    /// end, and ends the stream of records, even if it fails. Returns the device's last status.
     pub fn stop(&self) -> Result<Status, DeviceError> {
+        let status = self.close_and_account();
+        self.order(Order::Finish);
+        let deadline = Instant::now() + DRAIN_TIMEOUT;
+        while !self.shared.buffer.has_ended() && Instant::now() < deadline {
+            self.shared.wait_for_news(&self.shared.published(), Duration::from_millis(5));
+        }
+        status
+    }
+
+    fn close_and_account(&self) -> Result<Status, DeviceError> {
         for channel in Channel::ALL {
             self.close_channel(channel)?;
         }
@@ -235,11 +279,6 @@ impl Device {
                 }
             }
         }
-        self.order(Order::Finish);
-        let deadline = Instant::now() + DRAIN_TIMEOUT;
-        while !self.shared.buffer.has_ended() && Instant::now() < deadline {
-            self.shared.wait_for_news(&self.shared.published(), Duration::from_millis(5));
-        }
         Ok(status)
     }
 
@@ -260,9 +299,27 @@ impl Device {
         self.shared.published().counters
     }
 
+    /// From when on nothing is known of its buses, in UTC nanoseconds since the Unix epoch, and how long ago that is: when
+    /// it ended the session, or was last heard of.
+    pub(crate) fn last_known(&self) -> (i64, Duration) {
+        let now_ns = UtcClock::start().at(Instant::now()).0;
+        let published = self.shared.published();
+        if let Some(ended_ns) = published.ended_ns {
+            return (ended_ns, Duration::from_nanos(now_ns.saturating_sub(ended_ns).max(0) as u64));
+        }
+        let ago = published.heard_at.map_or(Duration::ZERO, |heard_at| heard_at.elapsed());
+        (now_ns.saturating_sub_unsigned(ago.as_nanos() as u64), ago)
+    }
+
     /// What is known about the device's clock.
     pub fn clock(&self) -> ClockReport {
-        self.shared.published().clock.unwrap_or(ClockReport { drift_ppm: None, round_trip_ns: 0 })
+        self.shared.published().clock
+    }
+
+    /// The map from the device's time to UTC as it is now, with the marks that it is made of. It goes on for as long as
+    /// crystals keep their rate: some seconds. Before the device has told its time, one that maps tick 0 to the epoch.
+    pub fn clock_map(&self) -> ClockMap {
+        self.shared.clock_map().unwrap_or_else(|| ClockMap::new(self.hello.tick_hz, UtcNs(0)))
     }
 }
 
@@ -333,64 +390,6 @@ impl Drop for Pending<'_> {
     fn drop(&mut self) {
         self.shared.forget(self.id);
     }
-}
-
-/// Opens the byte stream behind an address.
-fn connect(address: &Address) -> Result<Link, DeviceError> {
-    match address {
-        #[cfg(feature = "serial")]
-        Address::Serial(port) => serial::open(port),
-        #[cfg(not(feature = "serial"))]
-        Address::Serial(_) => not_built(address, "serial"),
-        #[cfg(feature = "virtual")]
-        Address::Virtual(options) => Ok(crate::virtual_device::start(parsed(options, address)?)?.into_link()),
-        #[cfg(not(feature = "virtual"))]
-        Address::Virtual(_) => not_built(address, "virtual"),
-        #[cfg(feature = "emu")]
-        Address::Emulated(file) => emulated(file, address),
-        #[cfg(not(feature = "emu"))]
-        Address::Emulated(_) => not_built(address, "emu"),
-    }
-}
-
-/// What stands behind an address's colon.
-#[cfg(any(feature = "virtual", feature = "emu"))]
-fn parsed<T: std::str::FromStr<Err: std::fmt::Display>>(
-    text: &str,
-    address: &Address,
-) -> Result<T, DeviceError> {
-    text.parse().map_err(|error: T::Err| DeviceError::BadAddress {
-        address: address.to_string(),
-        reason: error.to_string(),
-    })
-}
-
-#[cfg(feature = "emu")]
-fn emulated(file: &str, address: &Address) -> Result<Link, DeviceError> {
-    let board = parsed::<cantap_sim::address::Address>(file, address)?;
-    let port = board.open().map_err(|error| DeviceError::Emulation {
-        address: address.to_string(),
-        reason: error.to_string(),
-    })?;
-    Ok(Link::new(port.reader, port.writer).keeping(port.device))
-}
-
-impl Address {
-    /// Whether the options behind it fit, which [`Device::open`] would say too. Nothing is opened but a log that they name.
-    pub fn check(&self) -> Result<(), DeviceError> {
-        match self {
-            #[cfg(feature = "virtual")]
-            Self::Virtual(options) => parsed::<crate::virtual_device::Options>(options, self).map(|_| ()),
-            #[cfg(feature = "emu")]
-            Self::Emulated(file) => parsed::<cantap_sim::address::Address>(file, self).map(|_| ()),
-            _ => Ok(()),
-        }
-    }
-}
-
-#[cfg(not(all(feature = "serial", feature = "virtual", feature = "emu")))]
-fn not_built(address: &Address, feature: &'static str) -> Result<Link, DeviceError> {
-    Err(DeviceError::NotBuilt { address: address.to_string(), feature })
 }
 
 /// Captured records, in order. As an iterator it waits for the next one and ends after [`Device::stop`], or

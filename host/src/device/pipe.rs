@@ -56,6 +56,13 @@ impl PipeReader {
         len
     }
 
+    /// Waits until there is something to take, at most `timeout`. Returns whether there is.
+    pub fn wait_for_bytes(&self, timeout: Duration) -> bool {
+        let empty = |state: &mut State| state.bytes.is_empty() && !state.writer_gone;
+        let waited = self.0.changed.wait_timeout_while(self.0.lock(), timeout, empty);
+        !waited.unwrap_or_else(PoisonError::into_inner).0.bytes.is_empty()
+    }
+
     /// Whether the other end is gone and nothing is left.
     pub fn is_closed(&self) -> bool {
         let state = self.0.lock();

@@ -9,19 +9,22 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len};
+use cantap_wire::message::EndReason;
 use cantap_wire::record::LossStage;
-use cantap_wire::{CHANNELS, Channel, Command, Reply, Request, Response};
+use cantap_wire::{CHANNELS, Channel, Command, Refusal, Reply, Request, Response};
 
-use super::DeviceError;
 use super::buffer::Buffer;
-use super::clock::ClockReport;
+use super::clock::{ClockMap, ClockReport, Ticks};
+use super::error::Gone;
 use super::intake::{Counters, Intake, Notice, PIECE_BYTES, Transmission};
 use super::link::is_idle;
+use super::watch::{Next, Watch};
+use super::{DeviceError, SessionOver};
 
 /// Read at a time; an operating system's serial buffer is smaller.
 const READ_BYTES: usize = 64 * 1024;
-/// The device's time is asked for so often.
-const CLOCK_EVERY: Duration = Duration::from_secs(1);
+/// A device makes the host wait while it has no room; one that takes nothing for so long is stuck.
+const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
 /// What a request's answer can be.
 #[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
@@ -46,33 +49,89 @@ pub(super) enum Order {
 #[derive(Clone, Copy, Default)]
 pub(super) struct Published {
     pub counters: Counters,
-    pub clock: Option<ClockReport>,
+    pub clock: ClockReport,
     /// Times each channel stopped.
     pub stopped: [u32; CHANNELS],
-    /// Reads that brought something.
-    pub reads: u64,
+    /// Device time of the latest record, in ticks.
+    pub latest_ticks: u64,
+    /// When the device was last heard of.
+    pub heard_at: Option<Instant>,
+    /// When it ended the session, in UTC nanoseconds since the Unix epoch.
+    pub ended_ns: Option<i64>,
 }
 
 /// What the reader shares with the device's handle.
 pub(super) struct Shared {
     pub name: String,
-    pub writer: Mutex<Box<dyn Write + Send>>,
+    output: Mutex<Output>,
     pub buffer: Buffer,
     pub quit: AtomicBool,
     published: Mutex<Published>,
+    /// After the last round trip.
+    clock_map: Mutex<Option<ClockMap>>,
     changed: Condvar,
     pending: Mutex<Pending>,
 }
 
+/// Towards the device.
+struct Output {
+    port: Box<dyn Write + Send>,
+    /// The last message was cut short: what follows must not be read as its end.
+    is_cut: bool,
+}
+
+impl Output {
+    fn write(&mut self, bytes: &[u8], patience: Duration) -> std::io::Result<()> {
+        if self.is_cut {
+            write_patiently(&mut self.port, &[0], patience)?;
+        }
+        self.is_cut = true;
+        write_patiently(&mut self.port, bytes, patience)?;
+        self.is_cut = false;
+        self.port.flush()
+    }
+}
+
+/// Writes all, waiting as long as the other end makes us wait, at most for `patience` without taking anything.
+fn write_patiently(port: &mut dyn Write, mut bytes: &[u8], patience: Duration) -> std::io::Result<()> {
+    let mut moved = Instant::now();
+    while !bytes.is_empty() {
+        match port.write(bytes) {
+            Ok(0) => return Err(std::io::ErrorKind::WriteZero.into()),
+            Ok(len) => {
+                bytes = &bytes[len..];
+                moved = Instant::now();
+            }
+            Err(error) if is_idle(&error) && moved.elapsed() < patience => {}
+            Err(error) => return Err(error),
+        }
+    }
+    Ok(())
+}
+
 #[derive(Default)]
 struct Pending {
+    /// The first number that was ours.
+    first_id: u16,
     next_id: u16,
     waiting: HashMap<u16, SyncSender<Answer>>,
     /// Questions for the device's time that are under way.
     clock: Option<(u16, Instant)>,
     subscriber: Option<SyncSender<Transmission>>,
-    /// Why the port is gone.
-    gone: Option<String>,
+    gone: Option<Gone>,
+}
+
+impl Pending {
+    fn take_id(&mut self) -> u16 {
+        let id = self.next_id;
+        self.next_id = id.wrapping_add(1);
+        id
+    }
+
+    /// Whether we asked something with this number. (After 65,536 questions, every number was ours.)
+    fn is_ours(&self, id: u16) -> bool {
+        id.wrapping_sub(self.first_id) < self.next_id.wrapping_sub(self.first_id)
+    }
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -87,12 +146,13 @@ impl Shared {
         let next_id = start.map_or(1, |since| (since.as_micros() >> 4) as u16);
         Self {
             name: name.to_owned(),
-            writer: Mutex::new(writer),
+            output: Mutex::new(Output { port: writer, is_cut: false }),
             buffer: Buffer::new(capacity),
             quit: AtomicBool::new(false),
             published: Mutex::new(Published::default()),
+            clock_map: Mutex::new(None),
             changed: Condvar::new(),
-            pending: Mutex::new(Pending { next_id, ..Pending::default() }),
+            pending: Mutex::new(Pending { first_id: next_id, next_id, ..Pending::default() }),
         }
     }
 
@@ -100,10 +160,15 @@ impl Shared {
         *lock(&self.published)
     }
 
+    /// The map from device time to UTC.
+    pub fn clock_map(&self) -> Option<ClockMap> {
+        lock(&self.clock_map).clone()
+    }
+
     /// Waits until something new was published; at most `timeout`.
     pub fn wait_for_news(&self, seen: &Published, timeout: Duration) -> Published {
         let published = lock(&self.published);
-        let unchanged = |now: &mut Published| now.reads == seen.reads && now.stopped == seen.stopped;
+        let unchanged = |now: &mut Published| now.heard_at == seen.heard_at && now.stopped == seen.stopped;
         let waited = self.changed.wait_timeout_while(published, timeout, unchanged);
         *waited.unwrap_or_else(PoisonError::into_inner).0
     }
@@ -113,10 +178,9 @@ impl Shared {
         lock(&self.pending).subscriber = Some(subscriber);
     }
 
-    /// The port's end, if it has come.
+    /// Why the connection is of no use any more, if so.
     pub fn gone(&self) -> Option<DeviceError> {
-        let reason = lock(&self.pending).gone.clone()?;
-        Some(DeviceError::Vanished { address: self.name.clone(), reason })
+        lock(&self.pending).gone.as_ref().map(|gone| gone.error(&self.name))
     }
 
     /// Sends a request and returns where its answer will arrive.
@@ -125,8 +189,7 @@ impl Shared {
         let is_clock = matches!(command, Command::Time);
         let id = {
             let mut pending = lock(&self.pending);
-            let id = pending.next_id;
-            pending.next_id = id.wrapping_add(1);
+            let id = pending.take_id();
             pending.waiting.insert(id, sender);
             id
         };
@@ -148,26 +211,28 @@ impl Shared {
 
     /// Writes bytes as they are.
     pub fn write(&self, bytes: &[u8]) -> Result<(), DeviceError> {
-        let mut writer = lock(&self.writer);
-        let written = writer.write_all(bytes).and_then(|()| writer.flush());
-        written.map_err(|error| self.gone().unwrap_or_else(|| self.vanished(&error.to_string())))
-    }
-
-    fn vanished(&self, reason: &str) -> DeviceError {
-        DeviceError::Vanished { address: self.name.clone(), reason: reason.to_owned() }
+        let written = lock(&self.output).write(bytes, WRITE_PATIENCE);
+        written.map_err(|error| {
+            self.gone().unwrap_or_else(|| {
+                if is_idle(&error) {
+                    DeviceError::Timeout { seconds: WRITE_PATIENCE.as_secs_f32() }
+                } else {
+                    Gone::Vanished(error.to_string()).error(&self.name)
+                }
+            })
+        })
     }
 
     /// The reader's own question for the time; nobody waits for it, and it waits for nobody.
     fn ask_time(&self) {
-        let Ok(mut writer) = self.writer.try_lock() else { return };
+        let Ok(mut output) = self.output.try_lock() else { return };
         let mut pending = lock(&self.pending);
-        let id = pending.next_id;
-        pending.next_id = id.wrapping_add(1);
+        let id = pending.take_id();
         pending.clock = Some((id, Instant::now()));
         drop(pending);
         if let Ok(bytes) = encode(&Request { id, command: Command::Time }) {
-            // If it fails, reading fails too and says why.
-            let _ = writer.write_all(&bytes).and_then(|()| writer.flush());
+            // If it fails, reading fails too and says why, or nothing is answered, which is noticed.
+            let _ = output.write(&bytes, Duration::ZERO);
         }
     }
 }
@@ -186,54 +251,96 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
     let mut intake = Intake::new();
     let mut bytes = vec![0; READ_BYTES];
     let mut published = Published::default();
-    let mut asked = Instant::now();
-    let reason = loop {
+    let mut watch = Watch::default();
+    let mut passed_at = Instant::now();
+    let gone = loop {
         let len = match port.read(&mut bytes) {
-            Ok(0) => break "the connection was closed".to_owned(),
+            Ok(0) => break Gone::Vanished("the connection was closed".to_owned()),
             Ok(len) => len,
             Err(error) if is_idle(&error) => 0,
-            Err(error) => break error.to_string(),
+            Err(error) => break Gone::Vanished(error.to_string()),
         };
         if shared.quit.load(Ordering::Relaxed) {
             return shared.buffer.finish();
         }
         let finished = follow(orders, &mut intake, shared);
+        let mut heard = Heard::default();
         for piece in bytes[..len].chunks(PIECE_BYTES) {
             let answered = Instant::now();
             let mut times = None;
+            let is_ours = intake.is_in_session();
             let records = intake.push(piece, |notice| match notice {
-                Notice::Response(response) => times = answer(shared, response).or(times),
+                Notice::Response(response) => {
+                    heard.answered = true;
+                    if is_ours {
+                        heard.end = heard.end.or_else(|| ends_session(shared, &response));
+                    }
+                    times = answer(shared, response).or(times);
+                }
                 Notice::OtherProtocol(version) => refuse(shared, version),
                 Notice::Stopped(channel) => published.stopped[channel.index()] += 1,
                 Notice::Transmission(transmission) => report(shared, transmission),
+                Notice::WentBack => heard.end = heard.end.or(Some(SessionOver::StreamWentBack)),
+                Notice::Ended { time_ns, reason: EndReason::Suspended } => {
+                    published.ended_ns = Some(time_ns);
+                    heard.end = Some(SessionOver::Suspended);
+                }
             });
+            if !records.is_empty() || heard.answered {
+                published.heard_at = Some(answered);
+            }
             let lost = shared.buffer.push(records);
             intake.count_host_losses(lost);
             if let Some((ticks, asked)) = times {
                 intake.add_time(ticks, asked, answered);
+                *lock(&shared.clock_map) = Some(intake.clock().clone());
             }
         }
-        published.reads += u64::from(len > 0);
         published.counters = *intake.counters();
-        published.clock = Some(intake.clock().report());
+        published.clock = intake.clock().report();
+        published.latest_ticks = intake.latest_ticks();
         *lock(&shared.published) = published;
         shared.changed.notify_all();
         if finished {
             return shared.buffer.finish();
         }
-        if asked.elapsed() > CLOCK_EVERY && intake.is_in_session() {
-            shared.ask_time();
-            asked = Instant::now();
+        if let Some(end) = heard.end {
+            break Gone::Ended(end);
+        }
+        let now = Instant::now();
+        let passed = now.duration_since(std::mem::replace(&mut passed_at, now));
+        if intake.is_in_session() {
+            match watch.pass(passed, heard.answered) {
+                Next::Listen => {}
+                Next::Ask => shared.ask_time(),
+                Next::GiveUp(silent) => break Gone::Silent(silent),
+            }
         }
     };
-    shared.buffer.fail(shared.vanished(&reason));
+    shared.buffer.fail(gone.error(&shared.name));
     let mut pending = lock(&shared.pending);
-    pending.gone = Some(reason);
+    pending.gone = Some(gone);
     // Whoever waits for an answer learns that none will come.
     pending.waiting.clear();
     pending.subscriber = None;
     drop(pending);
     shared.changed.notify_all();
+}
+
+/// What was in one read, beside records.
+#[derive(Default)]
+struct Heard {
+    answered: bool,
+    end: Option<SessionOver>,
+}
+
+/// Whether an answer shows that our session is over.
+fn ends_session(shared: &Shared, response: &Response) -> Option<SessionOver> {
+    match response.result {
+        Err(Refusal::NoSession) => Some(SessionOver::Refused),
+        Ok(Reply::Hello(_)) if !lock(&shared.pending).is_ours(response.id) => Some(SessionOver::Greeted),
+        _ => None,
+    }
 }
 
 /// Does what was ordered. Returns whether to finish.
@@ -243,7 +350,10 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
             Order::BitLength { channel, clocks_per_bit, clock_hz, tick_hz } => {
                 intake.lengths().set(channel.index(), clocks_per_bit, clock_hz, tick_hz);
             }
-            Order::SettleClock => intake.clock().settle(),
+            Order::SettleClock => {
+                intake.clock().settle();
+                *lock(&shared.clock_map) = Some(intake.clock().clone());
+            }
             Order::Losses { channel, stage, count } => {
                 shared.buffer.push(intake.add_losses(channel, stage, count));
             }
@@ -254,10 +364,10 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
 }
 
 /// Passes an answer to whoever asked. Returns the device's time and when it was asked for, if it was.
-fn answer(shared: &Shared, response: Response) -> Option<(u64, Instant)> {
+fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
     let mut pending = lock(&shared.pending);
     let time = match (&response.result, pending.clock) {
-        (Ok(Reply::Time(ticks)), Some((id, asked))) if id == response.id => Some((*ticks, asked)),
+        (Ok(Reply::Time(ticks)), Some((id, asked))) if id == response.id => Some((Ticks(*ticks), asked)),
         _ => None,
     };
     if let Some(waiting) = pending.waiting.remove(&response.id) {

@@ -25,10 +25,8 @@ pub struct Board {
 
 /// Finds connected boards by their USB IDs. Where the system tells no IDs, it finds none.
 pub fn list() -> Result<Vec<Board>, DeviceError> {
-    let ports = serialport::available_ports().map_err(|error| DeviceError::Open {
-        address: "serial ports".to_owned(),
-        reason: error.to_string(),
-    })?;
+    let ports = serialport::available_ports()
+        .map_err(|error| DeviceError::Open { address: "serial ports".to_owned(), source: error.into() })?;
     Ok(ports
         .into_iter()
         .filter_map(|port| match port.port_type {
@@ -40,18 +38,25 @@ pub fn list() -> Result<Vec<Board>, DeviceError> {
         .collect())
 }
 
+/// The port at which the board with a serial number is now, if the system tells.
+pub fn port_of(serial_number: &str) -> Option<String> {
+    let board =
+        list().ok()?.into_iter().find(|board| board.serial_number.as_deref() == Some(serial_number))?;
+    Some(board.port)
+}
+
 /// Opens a port for this program alone, in raw mode, and raises DTR.
 pub(super) fn open(port: &str) -> Result<Link, DeviceError> {
     let open = serialport::new(port, NOMINAL_BAUD).timeout(READ_TIMEOUT).dtr_on_open(true).open();
-    let reader = open.map_err(|error| translate(port, &error))?;
-    let writer = reader.try_clone().map_err(|error| translate(port, &error))?;
+    let reader = open.map_err(|error| translate(port, error))?;
+    let writer = reader.try_clone().map_err(|error| translate(port, error))?;
     Ok(Link { reader: Box::new(reader), writer: Box::new(writer), keep_alive: Box::new(()) })
 }
 
-fn translate(port: &str, error: &serialport::Error) -> DeviceError {
+fn translate(port: &str, error: serialport::Error) -> DeviceError {
     let address = port.to_owned();
-    let reason = error.to_string();
-    let busy = reason.contains("lock") || reason.contains("busy");
+    let said = error.to_string();
+    let busy = said.contains("lock") || said.contains("busy");
     match error.kind {
         _ if busy => DeviceError::Busy { address },
         ErrorKind::Io(std::io::ErrorKind::PermissionDenied) if cfg!(windows) => DeviceError::Busy { address },
@@ -59,6 +64,6 @@ fn translate(port: &str, error: &serialport::Error) -> DeviceError {
         ErrorKind::NoDevice | ErrorKind::Io(std::io::ErrorKind::NotFound) => {
             DeviceError::NotFound { address }
         }
-        _ => DeviceError::Open { address, reason },
+        _ => DeviceError::Open { address, source: error.into() },
     }
 }

@@ -6,8 +6,8 @@
 
 use cantap_wire::CHANNELS;
 
-use crate::bits::bits_on_bus;
 use crate::{TraceEvent, TraceRecord};
+use cantap_trace::bits::bits_on_bus;
 
 /// A bit's length on each channel, while it is open.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]

@@ -170,9 +170,16 @@ impl Wire {
             self.abort_flight(can);
             // Six dominant bits are a stuff error.
             self.stuck = Some(Stuck { next_error: self.now + bit.cycles(6) });
+            // An error frame ends with eight recessive bits: until then a controller is busy, and leaves the bus for no request.
+            for n in &self.attached {
+                can.controllers[*n].bus_stuck();
+            }
         } else if !hold && self.stuck.take().is_some() {
             self.recessive = self.now;
             self.free = self.now + bit.cycles(SYNC_BITS);
+            for n in &self.attached {
+                can.controllers[*n].bus_free();
+            }
         }
     }
 

@@ -56,9 +56,29 @@ mod btr {
 /// Sequences of eleven recessive bits that a controller waits for in bus-off.
 const RECOVERY_SEQUENCES: u32 = 128;
 
+/// Core cycles from a master reset (MCR.RESET) to its acknowledgement by SLAK: 20 µs. The manual says nothing; Linux's driver
+/// (`drivers/net/can/bxcan.c`) polls every 10 ms. Long enough for a firmware that does not wait to be found out.
+const RESET_CYCLES: u64 = 20 * crate::CYCLES_PER_US;
+
+/// What a master reset takes with it. RM0090 Rev 21 §32.9.2 (CAN_MCR, RESET) only says that the receive FIFOs are empty and MCR
+/// has its reset value after it; Linux's driver sets everything up again. A firmware must live with both.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum MasterReset {
+    /// What the manual says: frames in the transmit mailboxes are sent when the controller is on a bus again.
+    Least,
+    /// All registers; CAN1's reset also clears the filter banks, which are CAN2's too.
+    #[default]
+    Most,
+}
+
 /// Where the controller stands in its handshakes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Mode {
+    /// A master reset is under way. What is written to MCR is lost.
+    Resetting {
+        /// It ends, in sleep mode, at this cycle.
+        until: u64,
+    },
     /// Low power; the state after reset.
     Sleep,
     /// Set-up; nothing is sent or received.
@@ -122,6 +142,8 @@ pub struct Controller {
     loopback_from: u64,
     cycles_per_clock: u64,
     dominant_bits: u64,
+    /// What a master reset takes with it.
+    pub(super) master_reset: MasterReset,
 }
 
 impl Default for Controller {
@@ -143,6 +165,7 @@ impl Default for Controller {
             loopback_from: 0,
             cycles_per_clock: 1,
             dominant_bits: 0,
+            master_reset: MasterReset::default(),
         }
     }
 }
@@ -195,7 +218,10 @@ impl Controller {
 
     fn write_mcr(&mut self, value: u32, now: u64) {
         if value & mcr::RESET != 0 {
-            *self = self.after_reset();
+            *self = self.after_master_reset(now);
+            return;
+        }
+        if let Mode::Resetting { .. } = self.mode {
             return;
         }
         self.mcr = value & mcr::WRITABLE;
@@ -270,9 +296,35 @@ impl Controller {
         [on(ier::TMEIE) && self.mailboxes.irq(), fifo(0), fifo(1), change]
     }
 
+    /// Ends a master reset whose time has come.
+    pub(super) fn advance_reset(&mut self, now: u64) {
+        if let Mode::Resetting { until } = self.mode
+            && until <= now
+        {
+            self.mode = Mode::Sleep;
+        }
+    }
+
+    /// A controller whose master reset begins.
+    fn after_master_reset(&self, now: u64) -> Self {
+        let mut after = self.after_reset();
+        after.mode = Mode::Resetting { until: now + RESET_CYCLES };
+        if self.master_reset == MasterReset::Least {
+            (after.ier, after.btr) = (self.ier, self.btr);
+            after.mailboxes = self.mailboxes.clone();
+            after.mailboxes.cut_off();
+        }
+        after
+    }
+
     /// A controller as after a reset, with what does not belong to its registers kept.
     pub(super) fn after_reset(&self) -> Self {
-        Self { cycles_per_clock: self.cycles_per_clock, dominant_bits: self.dominant_bits, ..Self::default() }
+        Self {
+            cycles_per_clock: self.cycles_per_clock,
+            dominant_bits: self.dominant_bits,
+            master_reset: self.master_reset,
+            ..Self::default()
+        }
     }
 }
 

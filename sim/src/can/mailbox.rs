@@ -175,6 +175,16 @@ impl Mailboxes {
         }
     }
 
+    /// The controller was reset in the middle of an attempt: the frame waits for the next.
+    pub fn cut_off(&mut self) {
+        for mailbox in &mut self.boxes {
+            mailbox.abort = false;
+            if let Phase::Sending(request) = mailbox.phase {
+                mailbox.phase = Phase::Pending(request);
+            }
+        }
+    }
+
     /// Whether a request was completed and its flag not cleared.
     pub fn irq(&self) -> bool {
         self.boxes.iter().any(|mailbox| mailbox.status & RQCP != 0)

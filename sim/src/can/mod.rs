@@ -13,11 +13,14 @@ pub mod mailbox;
 
 use cantap_wire::Frame;
 
-pub use controller::{Controller, Mode, Timing};
+pub use controller::{Controller, MasterReset, Mode, Timing};
 use filter::Filters;
 
 /// Registers of CAN2 begin this far above CAN1's.
 const CAN2: u32 = 0x400;
+/// CAN1's master control register and its reset bit.
+const MCR: u32 = 0;
+const MCR_RESET: u32 = 1 << 15;
 /// Filter registers, in CAN1 only.
 const FILTERS: std::ops::Range<u32> = 0x200..0x400;
 
@@ -43,10 +46,20 @@ impl CanPair {
     /// Writes a register; `None` where there is none, or where the hardware would not take it.
     pub fn write(&mut self, offset: u32, value: u32, now: u64) -> Option<()> {
         self.advance(now);
+        if offset == MCR && value & MCR_RESET != 0 && self.controllers[0].master_reset == MasterReset::Most {
+            self.filters = Filters::default();
+        }
         match offset {
             offset if FILTERS.contains(&offset) => self.filters.write(offset, value),
             0..CAN2 => self.controllers[0].write(offset, value, now),
             _ => self.controllers[1].write(offset - CAN2, value, now),
+        }
+    }
+
+    /// Decides what a master reset takes with it.
+    pub fn set_master_reset(&mut self, scope: MasterReset) {
+        for controller in &mut self.controllers {
+            controller.master_reset = scope;
         }
     }
 
@@ -69,6 +82,7 @@ impl CanPair {
     /// Completes what loop-back sent until `now`.
     pub fn advance(&mut self, now: u64) {
         for n in 0..self.controllers.len() {
+            self.controllers[n].advance_reset(now);
             while let Some(frame) = self.controllers[n].advance_loopback(now) {
                 self.receive(n, &frame);
             }

@@ -121,7 +121,7 @@ impl Ledger {
                 }
                 books.at_least |= at_least;
             }
-            Heard::Record(_, Record::Event(_)) => {}
+            Heard::Record(_, Record::Event(_)) | Heard::Ended(..) => {}
             Heard::BatchesLost(frames) => {
                 for (books, lost) in self.books.iter_mut().zip(frames) {
                     books.announced.link += u64::from(*lost);

@@ -1,7 +1,7 @@
 //! One side of the conversation: requests out, responses and records in. No I/O and no time.
 
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
-use cantap_wire::message::Response;
+use cantap_wire::message::{EndReason, Response};
 use cantap_wire::{CHANNELS, Command, Corruption, Decoded, Decoder, PROTOCOL_VERSION, Record, Request};
 
 /// What the device said, apart from responses.
@@ -11,6 +11,8 @@ pub enum Heard {
     Record(u64, Record),
     /// Batches are missing here, with so many frames of each channel.
     BatchesLost([u32; CHANNELS]),
+    /// The device has ended the session, at this device time.
+    Ended(u64, EndReason),
 }
 
 /// The conversation.
@@ -55,21 +57,15 @@ impl Session {
     /// Takes bytes from the device and reports records in their order.
     pub fn take(&mut self, bytes: &[u8], mut report: impl FnMut(Heard)) {
         self.bytes += bytes.len() as u64;
-        let mut restart = false;
         let Self { decoder, responses, corruptions, .. } = self;
         decoder.push(bytes, |decoded| match decoded {
             Decoded::Record { ticks, record } => report(Heard::Record(ticks, record)),
             Decoded::BatchesLost { frames, .. } => report(Heard::BatchesLost(frames)),
-            Decoded::Response(response) => {
-                restart |= matches!(response.result, Ok(cantap_wire::Reply::Hello(_)));
-                responses.push(response.clone());
-            }
+            Decoded::Response(response) => responses.push(response.clone()),
             Decoded::Corrupt(corruption) => corruptions.push(corruption),
+            Decoded::Ended { ticks, reason } => report(Heard::Ended(ticks, reason)),
             Decoded::OtherProtocol(_) => corruptions.push(Corruption::Unknown),
         });
-        if restart {
-            self.decoder.restart();
-        }
     }
 
     /// Takes the response to request `id`, if it came.

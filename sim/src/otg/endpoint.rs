@@ -101,6 +101,7 @@ impl Endpoint {
         }
         if value & epctl::CNAK != 0 {
             self.control &= !epctl::NAKSTS;
+            self.interrupt &= !epint::INEPNE;
         }
         if value & epctl::SNAK != 0 {
             self.control |= epctl::NAKSTS;

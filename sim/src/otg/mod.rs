@@ -53,6 +53,10 @@ pub struct Otg {
     ins: [Endpoint; ENDPOINTS],
     outs: [Endpoint; ENDPOINTS],
     rx: RxFifo,
+    /// The status that was looked at last and not taken since.
+    peeked: Option<u32>,
+    /// Ends of OUT transfers that wait in the receive FIFO, by endpoint.
+    completing: [u32; ENDPOINTS],
     txs: [TxFifo; ENDPOINTS],
     /// The interrupt line, recomputed after every change.
     line: bool,
@@ -68,9 +72,23 @@ pub struct Misuse {
     pub rx_misreads: u64,
     /// Accesses to registers that the model does not have.
     pub unknown_registers: u64,
-    /// FIFOs that overlap or pass the end of the RAM when endpoints are in use.
+    /// FIFOs that overlap, pass the end of the RAM or are too small when endpoints are in use.
     pub bad_fifo_layout: u64,
+    /// An OUT endpoint's NAK taken back while the end of its transfer waits in the receive FIFO and the driver has not seen it: cores of
+    /// this family lose four bytes of a packet then (libopencm3 #600, #672, #873).
+    pub early_cnaks: u64,
+    /// IN endpoints disabled before their NAK was effective, or FIFOs flushed under a transfer (RM0090, "IN endpoint disable",
+    /// GRSTCTL).
+    pub unruly_disables: u64,
+    /// Transfer sizes written while the transfer is armed.
+    pub resized_transfers: u64,
 }
+
+/// The least words of the receive FIFO: 5 · 1 + 8 for SETUP packets, 1 for global OUT NAK, a packet of 64 bytes with its status, two for
+/// each of two OUT endpoints (RM0090, "Receive data FIFO").
+const LEAST_RX_WORDS: u32 = 5 + 8 + 1 + 16 + 1 + 2 * 2;
+/// The least words of a transmit FIFO (RM0090, DIEPTXFx).
+const LEAST_TX_WORDS: u32 = 16;
 
 impl Otg {
     /// Out of reset.
@@ -106,6 +124,8 @@ impl Otg {
             ins: [Endpoint::default(); ENDPOINTS],
             outs: [Endpoint::default(); ENDPOINTS],
             rx: RxFifo::default(),
+            peeked: None,
+            completing: [0; ENDPOINTS],
             txs: Default::default(),
             line: false,
             misuse: Misuse::default(),
@@ -133,7 +153,10 @@ impl Otg {
             global::GRSTCTL => grstctl::AHBIDL,
             global::GINTSTS => self.gintsts(),
             global::GINTMSK => self.interrupt_mask,
-            global::GRXSTSR => self.rx.peek_status().unwrap_or_else(|| self.misread()),
+            global::GRXSTSR => {
+                self.peeked = self.rx.peek_status();
+                self.peeked.unwrap_or_else(|| self.misread())
+            }
             global::GRXSTSP => self.pop_status(),
             global::GRXFSIZ => self.rx_size,
             global::DIEPTXF0 => self.tx_sizes[0],
@@ -264,8 +287,18 @@ impl Otg {
         }
         if value & grstctl::RXFFLSH != 0 {
             self.rx.flush();
+            self.completing = [0; ENDPOINTS];
         }
         if value & grstctl::TXFFLSH != 0 {
+            let flushed = value >> grstctl::TXFNUM_SHIFT & 0x1F;
+            let under_way = (0..ENDPOINTS).filter(|number| {
+                let named = flushed == grstctl::TXFNUM_ALL || flushed as usize == self.fifo_of(*number);
+                named
+                    && self.ins[*number].active()
+                    && self.ins[*number].enabled()
+                    && !self.ins[*number].naks()
+            });
+            self.misuse.unruly_disables += under_way.count() as u64;
             match value >> grstctl::TXFNUM_SHIFT & 0x1F {
                 grstctl::TXFNUM_ALL => self.txs.iter_mut().for_each(TxFifo::flush),
                 one => {
@@ -306,12 +339,17 @@ impl Otg {
     /// Takes a status from the receive queue. The two "complete" states raise the endpoint's interrupt
     /// when they are taken (RM0090, GRXSTSP).
     fn pop_status(&mut self) -> u32 {
+        self.peeked = None;
         let Some(status) = self.rx.pop_status() else {
             return self.misread();
         };
         let out = &mut self.outs[(status & 0xF) as usize % ENDPOINTS];
         match status >> 17 & 0xF {
-            registers::pktsts::OUT_COMPLETE => out.interrupt |= epint::XFRC,
+            registers::pktsts::OUT_COMPLETE => {
+                out.interrupt |= epint::XFRC;
+                let completing = &mut self.completing[(status & 0xF) as usize % ENDPOINTS];
+                *completing = completing.saturating_sub(1);
+            }
             registers::pktsts::SETUP_COMPLETE => out.interrupt |= epint::STUP,
             _ => {}
         }
@@ -371,6 +409,7 @@ impl Otg {
     }
 
     fn write_endpoint(&mut self, input: bool, number: usize, register: u32, value: u32) {
+        self.judge(input, number, register, value);
         let endpoint = if input { &mut self.ins[number] } else { &mut self.outs[number] };
         match register {
             // Endpoint 0 OUT cannot be disabled (RM0090, DOEPCTL0).
@@ -395,6 +434,30 @@ impl Otg {
         }
     }
 
+    /// Counts what a driver must not write to an endpoint as it stands.
+    fn judge(&mut self, input: bool, number: usize, register: u32, value: u32) {
+        let endpoint = if input { &self.ins[number] } else { &self.outs[number] };
+        match register {
+            device::EPCTL if input => {
+                let ends = value & registers::epctl::EPDIS != 0 && endpoint.enabled() && endpoint.active();
+                self.misuse.unruly_disables += u64::from(ends && endpoint.interrupt & epint::INEPNE == 0);
+            }
+            device::EPCTL => {
+                let clears = value & registers::epctl::CNAK != 0;
+                let seen = self.peeked.is_some_and(|status| {
+                    status >> 17 & 0xF == registers::pktsts::OUT_COMPLETE && (status & 0xF) as usize == number
+                });
+                self.misuse.early_cnaks += u64::from(clears && self.completing[number] > 0 && !seen);
+            }
+            device::EPTSIZ => {
+                // Endpoint 0 OUT cannot be disabled, and takes new SETUP packets while it is armed.
+                let armed = endpoint.enabled() && endpoint.active() && (input || number != 0);
+                self.misuse.resized_transfers += u64::from(armed);
+            }
+            _ => {}
+        }
+    }
+
     /// Counts a FIFO layout that does not fit the RAM or overlaps.
     fn check_layout(&mut self) {
         let mut parts = vec![(0, self.rx_size)];
@@ -404,8 +467,14 @@ impl Otg {
             }
         }
         parts.sort_unstable();
+        let active = (0..ENDPOINTS).filter(|number| self.ins[*number].active());
+        let large_enough = self.rx_size >= LEAST_RX_WORDS
+            && active
+                .map(|number| self.tx_depth(self.fifo_of(number)))
+                .all(|words| words >= LEAST_TX_WORDS as usize);
         let fits = parts.windows(2).all(|pair| pair[0].1 <= pair[1].0)
-            && parts.last().is_none_or(|last| last.1 <= FIFO_WORDS);
+            && parts.last().is_none_or(|last| last.1 <= FIFO_WORDS)
+            && large_enough;
         if !fits {
             self.misuse.bad_fifo_layout += 1;
         }

@@ -1,5 +1,5 @@
-//! The controller driven with the register sequences of synopsys-usb-otg 0.4, the driver that the
-//! firmware uses.
+//! The controller driven with the register sequences of synopsys-usb-otg 0.4, a driver that is not the firmware's: what it does
+//! and the chip does not forgive must be seen here.
 
 use super::registers::{
     dcfg, dctl, device, epctl, epint, eptsiz, gahbcfg, gccfg, gint, global, grstctl, pktsts,
@@ -278,6 +278,85 @@ fn what_the_chip_does_not_forgive_is_counted() {
         otg.write(FIFOS + 2 * FIFO_STRIDE, 0);
     }
     otg.read(0x440);
-    let misuse = Misuse { tx_overflows: 1, rx_misreads: 1, unknown_registers: 1, bad_fifo_layout: 0 };
+    let misuse = Misuse { tx_overflows: 1, rx_misreads: 1, unknown_registers: 1, ..Misuse::default() };
     assert_eq!(otg.misuse(), misuse);
+}
+
+#[test]
+fn a_transfer_of_several_packets_leaves_packet_by_packet_and_ends_once() {
+    let mut otg = running();
+    otg.write(global::DIEPTXF1 + 4, 64 << 16 | 0x60);
+    otg.write(at(IN, 2, device::EPTSIZ), 3 << eptsiz::PKTCNT_SHIFT | 0x82);
+    modify(&mut otg, at(IN, 2, device::EPCTL), epctl::CNAK | epctl::EPENA);
+    let words = (0..33u32).map(|n| otg.write(FIFOS + 2 * FIFO_STRIDE, n * 0x0101_0101)).count();
+    assert_eq!(words, 33);
+    let InReply::Data { data1: false, bytes } = otg.in_token(0, 2, true) else { panic!() };
+    assert_eq!((bytes.len(), bytes[4], otg.irq()), (64, 1, false));
+    let InReply::Data { data1: true, bytes } = otg.in_token(0, 2, true) else { panic!() };
+    assert_eq!((bytes.len(), bytes[0], otg.irq()), (64, 16, false));
+    // A third of the way from its end, what is left can be read.
+    assert_eq!(otg.read(at(IN, 2, device::EPTSIZ)) >> eptsiz::PKTCNT_SHIFT, 1);
+    assert_eq!(otg.in_token(0, 2, true), data(false, &[32, 32]));
+    assert!(otg.irq());
+}
+
+#[test]
+fn nak_taken_back_before_the_end_of_the_transfer_is_counted() {
+    let mut otg = running();
+    assert_eq!(otg.out(0, 1, false, b"hello"), OutReply::Ack);
+    let between = otg.read(global::GRXSTSP);
+    assert_eq!(between >> 17 & 0xF, pktsts::OUT_DATA);
+    otg.read(FIFOS);
+    otg.read(FIFOS);
+    modify(&mut otg, at(OUT, 1, device::EPCTL), epctl::CNAK);
+    assert_eq!(otg.misuse().early_cnaks, 1);
+    assert_eq!(receive(&mut otg).1, pktsts::OUT_COMPLETE);
+    assert_eq!(otg.misuse().early_cnaks, 1, "after the end it may be");
+}
+
+#[test]
+fn an_endpoint_disabled_out_of_order_is_counted() {
+    let mut otg = running();
+    assert!(write_packet(&mut otg, 2, &[7; 64]));
+    modify(&mut otg, at(IN, 2, device::EPCTL), epctl::EPDIS | epctl::SNAK);
+    assert_eq!(otg.misuse().unruly_disables, 1, "NAK was not effective yet");
+    otg.write(global::GRSTCTL, grstctl::TXFFLSH | 2 << grstctl::TXFNUM_SHIFT);
+    assert!(write_packet(&mut otg, 2, &[7; 64]));
+    otg.write(global::GRSTCTL, grstctl::TXFFLSH | 2 << grstctl::TXFNUM_SHIFT);
+    assert_eq!(otg.misuse().unruly_disables, 2, "flushed under a transfer");
+    modify(&mut otg, at(IN, 2, device::EPCTL), epctl::SNAK);
+    assert_ne!(otg.read(at(IN, 2, device::EPINT)) & epint::INEPNE, 0);
+    modify(&mut otg, at(IN, 2, device::EPCTL), epctl::EPDIS | epctl::SNAK);
+    otg.write(global::GRSTCTL, grstctl::TXFFLSH | 2 << grstctl::TXFNUM_SHIFT);
+    assert_eq!(otg.misuse(), Misuse { unruly_disables: 2, ..Misuse::default() });
+}
+
+#[test]
+fn fifos_that_are_too_small_or_overlap_are_counted() {
+    for (register, value, bad) in [
+        (global::DIEPTXF1 + 4, 16 << 16 | 0x60, false),
+        (global::DIEPTXF1 + 4, 15 << 16 | 0x60, true),
+        (global::DIEPTXF1 + 4, 16 << 16 | 0x5F, true),
+        (global::DIEPTXF3, 16 << 16 | 0x131, true),
+        (global::GRXFSIZ, 34, true),
+    ] {
+        let mut otg = running();
+        otg.write(register, value);
+        modify(&mut otg, at(IN, 2, device::EPCTL), epctl::EPENA);
+        assert_eq!(otg.misuse().bad_fifo_layout > 0, bad, "{register:#x} {value:#x}");
+    }
+}
+
+#[test]
+fn a_toggle_that_is_not_expected_is_acknowledged_and_dropped_until_it_is_reset() {
+    let mut otg = running();
+    assert_eq!(otg.out(0, 1, false, b"one"), OutReply::Ack);
+    assert_eq!(receive(&mut otg).2, b"one");
+    receive(&mut otg);
+    // The host begins anew, and the device does not: the packet is lost.
+    assert_eq!(otg.out(0, 1, false, b"two"), OutReply::Ack);
+    assert!(!otg.irq());
+    modify(&mut otg, at(OUT, 1, device::EPCTL), epctl::SD0PID);
+    assert_eq!(otg.out(0, 1, false, b"two"), OutReply::Ack);
+    assert_eq!(receive(&mut otg).2, b"two");
 }

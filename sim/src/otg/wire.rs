@@ -155,6 +155,7 @@ impl Otg {
         }
         self.rx.push(endpoint, pktsts::OUT_DATA, data1, bytes);
         if complete {
+            self.completing[number] += 1;
             self.rx.push(endpoint, pktsts::OUT_COMPLETE, data1, &[]);
         }
         self.update();

@@ -8,16 +8,20 @@ use crate::CYCLES_PER_US;
 use crate::cpu::Memory;
 use crate::memory_map::FLASH;
 
-const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
+/// What unlocks the control register.
+pub const KEYS: [u32; 2] = [0x4567_0123, 0xCDEF_89AB];
 const PG: u32 = 1;
 const SER: u32 = 1 << 1;
 const MER: u32 = 1 << 2;
 const STRT: u32 = 1 << 16;
 const LOCK: u32 = 1 << 31;
 const EOP: u32 = 1;
-/// Programming errors: alignment, parallelism, sequence.
-const PGPERR: u32 = 1 << 6;
-const PGSERR: u32 = 1 << 7;
+/// Error of programming: a store of another width than was set up.
+pub const PGPERR: u32 = 1 << 6;
+/// Error of programming: a store that was not set up.
+pub const PGSERR: u32 = 1 << 7;
+/// Every error: operation, write protection, alignment and those two.
+const ERRORS: u32 = 1 << 1 | 1 << 4 | 1 << 5 | PGPERR | PGSERR;
 const PROGRAM_US: u64 = 16;
 
 /// The sectors: four of 16 KiB, one of 64, seven of 128, with the time their erasure takes in ms.
@@ -30,6 +34,25 @@ fn sector(number: u32) -> Option<(Range<u32>, u64)> {
     };
     let start = FLASH.start + offset * 1024;
     Some((start..start + kib * 1024, ms))
+}
+
+/// The wait states that a core clock asks for at 2.7 to 3.6 V (RM0090 Rev 21 Table 11): one for each 30 MHz begun
+/// beyond the first.
+pub fn least_wait_states(hclk_hz: u64) -> u64 {
+    hclk_hz.div_ceil(30_000_000).saturating_sub(1)
+}
+
+/// How flash is read (FLASH_ACR, RM0090 Rev 21 §3.9.1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Access {
+    /// LATENCY.
+    pub wait_states: u64,
+    /// PRFTEN.
+    pub prefetch: bool,
+    /// ICEN.
+    pub instruction_cache: bool,
+    /// DCEN.
+    pub data_cache: bool,
 }
 
 /// The register block, and the memory behind it.
@@ -56,6 +79,17 @@ impl FlashInterface {
     #[must_use]
     pub fn after_reset(&self) -> Self {
         Self::new(self.memory.clone())
+    }
+
+    /// How the program has set up reading.
+    pub fn access(&self) -> Access {
+        let set = |bit: u32| self.access >> bit & 1 != 0;
+        Access {
+            wait_states: (self.access & 7).into(),
+            prefetch: set(8),
+            instruction_cache: set(9),
+            data_cache: set(10),
+        }
     }
 
     /// Reads a register; `None` where there is none.
@@ -93,9 +127,13 @@ impl FlashInterface {
         Some(())
     }
 
-    /// A wrong key locks the register until the next reset.
+    /// A wrong key, or one that is not wanted, locks the register until the next reset (RM0090,
+    /// "Unlocking the Flash control register").
     fn take_key(&mut self, key: u32) {
-        if KEYS.get(self.keys_given) == Some(&key) {
+        if self.control & LOCK == 0 {
+            self.control |= LOCK;
+            self.keys_given = usize::MAX;
+        } else if KEYS.get(self.keys_given) == Some(&key) {
             self.keys_given += 1;
             if self.keys_given == KEYS.len() {
                 self.control &= !LOCK;
@@ -105,7 +143,21 @@ impl FlashInterface {
         }
     }
 
+    /// Whether an error that nobody has cleared keeps the interface from working. The manual does not say so; users of the chip
+    /// report it, and ST's own drivers clear the flags first.
+    fn is_stuck(&self) -> bool {
+        self.status & ERRORS != 0
+    }
+
+    /// Sets an error's flag, as a failed access does.
+    pub fn leave_error(&mut self, error: u32) {
+        self.status |= error;
+    }
+
     fn erase(&mut self) {
+        if self.is_stuck() {
+            return;
+        }
         let sectors = match self.control & (SER | MER) {
             SER => (self.control >> 3 & 15)..(self.control >> 3 & 15) + 1,
             MER => 0..12,
@@ -128,7 +180,7 @@ impl FlashInterface {
     /// A store to flash: programs, if that was set up. Bits only go from 1 to 0.
     pub fn program(&mut self, address: u32, size: u8, value: u32) {
         let parallelism = 1 << (self.control >> 8 & 3);
-        if self.control & PG == 0 || self.control & LOCK != 0 {
+        if self.control & PG == 0 || self.control & LOCK != 0 || self.is_stuck() {
             self.status |= PGSERR;
             return;
         }
@@ -191,10 +243,35 @@ mod tests {
         flash.program(FLASH.start, 4, 0);
         assert_eq!(memory.word(FLASH.start), Some(u32::MAX));
         assert_ne!(flash.read(0x0C).unwrap() & PGSERR, 0);
+        flash.write(0x0C, PGSERR).unwrap();
         flash.write(0x04, 1).unwrap();
         for key in KEYS {
             flash.write(0x04, key).unwrap();
         }
         assert_ne!(flash.read(0x10).unwrap() & LOCK, 0, "a wrong key locks until reset");
+    }
+
+    #[test]
+    fn an_error_that_nobody_clears_blocks_whatever_follows() {
+        let (mut flash, memory) = unlocked();
+        let address = 0x080E_0000;
+        flash.leave_error(PGPERR);
+        flash.write(0x10, PG | 2 << 8).unwrap();
+        flash.program(address, 4, 0);
+        flash.write(0x10, SER | 11 << 3 | STRT).unwrap();
+        assert_eq!((memory.word(address), flash.take_stall()), (Some(u32::MAX), 0));
+        flash.write(0x0C, PGPERR | PGSERR).unwrap();
+        flash.write(0x10, PG | 2 << 8).unwrap();
+        flash.program(address, 4, 0);
+        assert_eq!(memory.word(address), Some(0));
+    }
+
+    #[test]
+    fn a_key_that_is_not_wanted_locks_until_reset() {
+        let (mut flash, _) = unlocked();
+        for key in KEYS {
+            flash.write(0x04, key).unwrap();
+        }
+        assert_ne!(flash.read(0x10).unwrap() & LOCK, 0);
     }
 }

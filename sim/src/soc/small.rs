@@ -57,6 +57,46 @@ impl Gpio {
     }
 }
 
+/// The CRC unit: CRC-32 with the polynomial 04C11DB7 over whole words, the highest bit first (RM0090, "CRC calculation unit").
+#[derive(Clone, Debug)]
+pub struct Crc {
+    sum: u32,
+    scratch: u32,
+}
+
+impl Default for Crc {
+    fn default() -> Self {
+        Self { sum: u32::MAX, scratch: 0 }
+    }
+}
+
+impl Crc {
+    /// Reads a register; `None` where there is none.
+    pub fn read(&self, offset: u32) -> Option<u32> {
+        match offset {
+            0 => Some(self.sum),
+            4 => Some(self.scratch),
+            8 => Some(0),
+            _ => None,
+        }
+    }
+
+    /// Writes a register; `None` where there is none.
+    pub fn write(&mut self, offset: u32, value: u32) -> Option<()> {
+        match offset {
+            0 => {
+                self.sum = (0..32)
+                    .fold(self.sum ^ value, |sum, _| sum << 1 ^ if sum >> 31 == 0 { 0 } else { 0x04C1_1DB7 });
+            }
+            4 => self.scratch = value & 0xFF,
+            8 if value & 1 != 0 => self.sum = u32::MAX,
+            8 => {}
+            _ => return None,
+        }
+        Some(())
+    }
+}
+
 /// The watchdog's own oscillator.
 const LSI_HZ: u64 = 32_000;
 
@@ -114,14 +154,10 @@ const FLASH_KIB: u16 = 1024;
 const VREFINT_CAL: u16 = 1502;
 const TS_CAL1: u16 = 943;
 const TS_CAL2: u16 = 1205;
-/// The ROM bootloader's first two words: its stack and its entry.
-const BOOTLOADER: [u32; 2] = [0x2000_2D40, 0x1FFF_3DA5];
 
-/// Reads system memory.
-pub fn system_memory(address: u32, size: u8) -> u32 {
+/// Reads the factory values.
+pub fn factory_values(address: u32, size: u8) -> u32 {
     let word = match address & !3 {
-        0x1FFF_0000 => BOOTLOADER[0],
-        0x1FFF_0004 => BOOTLOADER[1],
         at @ 0x1FFF_7A10..=0x1FFF_7A18 => UNIQUE_ID[(at - 0x1FFF_7A10) as usize / 4],
         0x1FFF_7A20 => u32::from(FLASH_KIB) << 16 | 0xFFFF,
         0x1FFF_7A28 => u32::from(VREFINT_CAL) << 16 | 0xFFFF,
@@ -246,9 +282,9 @@ mod tests {
 
     #[test]
     fn the_factory_values_are_where_the_manual_says() {
-        assert_eq!(system_memory(0x1FFF_7A10, 4), UNIQUE_ID[0]);
-        assert_eq!(system_memory(0x1FFF_7A22, 2), 1024);
-        assert_eq!(system_memory(0x1FFF_7A2A, 2), u32::from(VREFINT_CAL));
-        assert_eq!(system_memory(0x1FFF_7A2E, 2), u32::from(TS_CAL2));
+        assert_eq!(factory_values(0x1FFF_7A10, 4), UNIQUE_ID[0]);
+        assert_eq!(factory_values(0x1FFF_7A22, 2), 1024);
+        assert_eq!(factory_values(0x1FFF_7A2A, 2), u32::from(VREFINT_CAL));
+        assert_eq!(factory_values(0x1FFF_7A2E, 2), u32::from(TS_CAL2));
     }
 }

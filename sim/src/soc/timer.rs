@@ -1,12 +1,16 @@
 //! General-purpose and basic timers, counting up (RM0090 Rev 21 §18, §20): prescaler, auto-reload,
-//! four compare channels, their flags and interrupt. Capture, PWM outputs and slave modes are not
-//! modelled.
+//! four compare channels, their flags and interrupt; and capture of the count by an internal trigger (TRC). Capture by pins, PWM
+//! outputs and slave modes are not modelled.
 
 const CEN: u32 = 1;
 const UDIS: u32 = 1 << 1;
 const URS: u32 = 1 << 2;
 const OPM: u32 = 1 << 3;
 const ARPE: u32 = 1 << 7;
+/// SMCR.TS: which internal trigger is selected, with all others 0 to 3.
+const TS_SHIFT: u32 = 4;
+/// CCxS: the channel's input is the selected trigger.
+const TRC: u32 = 3;
 /// UIF, and the flags of compare channels 1 to 4 above it.
 const UIF: u32 = 1;
 
@@ -30,6 +34,8 @@ pub struct Timer {
     reload: u32,
     next_reload: u32,
     compare: [u32; 4],
+    /// TIMx_OR: what the internal triggers and inputs come from.
+    options: u32,
 }
 
 impl Timer {
@@ -52,6 +58,7 @@ impl Timer {
             reload: max,
             next_reload: max,
             compare: [0; 4],
+            options: 0,
         }
     }
 
@@ -84,7 +91,15 @@ impl Timer {
             0x24 => self.count,
             0x28 => self.next_prescaler,
             0x2C => self.next_reload,
-            0x34..=0x40 => self.compare[(offset - 0x34) as usize / 4],
+            0x34..=0x40 => {
+                let channel = (offset - 0x34) as usize / 4;
+                if self.input(channel) != 0 {
+                    // Reading what was captured clears the flag that says so.
+                    self.flags &= !(UIF << (1 + channel));
+                }
+                self.compare[channel]
+            }
+            0x50 if self.max == u32::MAX => self.options,
             _ => return None,
         })
     }
@@ -124,10 +139,41 @@ impl Timer {
                     self.reload = self.next_reload;
                 }
             }
-            0x34..=0x40 => self.compare[(offset - 0x34) as usize / 4] = value & self.max,
+            0x34..=0x40 => {
+                let channel = (offset - 0x34) as usize / 4;
+                // A captured value is read-only.
+                if self.input(channel) == 0 {
+                    self.compare[channel] = value & self.max;
+                }
+            }
+            0x50 if self.max == u32::MAX => self.options = value & 0xCC0,
             _ => return None,
         }
         Some(())
+    }
+
+    /// A pulse of the peripheral with number `source` in ITR1_RMP, at the core cycle `at`, which may be a little past.
+    pub fn remapped_trigger(&mut self, source: u32, at: u64, now: u64) {
+        if self.options >> 10 & 3 != source || self.slave >> TS_SHIFT & 7 != 1 {
+            return;
+        }
+        self.advance(now);
+        // The count may have moved on since.
+        let back = self.since.saturating_sub(at).div_ceil(self.tick());
+        let count = self.count.wrapping_sub(back as u32) & self.max;
+        for channel in 0..4 {
+            if self.input(channel) == TRC && self.modes[2] >> (4 * channel) & 1 != 0 {
+                let flag = UIF << (1 + channel);
+                // Over what nobody has read: CCxOF.
+                self.flags |= if self.flags & flag == 0 { flag } else { flag << 8 };
+                self.compare[channel] = count;
+            }
+        }
+    }
+
+    /// CCxS: 0 for an output, which compares; else where the input comes from.
+    fn input(&self, channel: usize) -> u32 {
+        self.modes[channel / 2] >> (8 * (channel % 2)) & 3
     }
 
     /// The core cycle at which the count was zero, were it to have run at its present rate all the time.
@@ -168,7 +214,8 @@ impl Timer {
             let to_update = self.ticks_to_update();
             let step = ticks.min(to_update);
             for channel in 0..4 {
-                if self.ticks_to(self.compare[channel]).is_some_and(|due| due <= step) {
+                let compares = self.input(channel) == 0;
+                if compares && self.ticks_to(self.compare[channel]).is_some_and(|due| due <= step) {
                     self.flags |= UIF << (1 + channel);
                 }
             }
@@ -265,6 +312,45 @@ mod tests {
         assert!(!timer.irq());
         // The same value again a whole turn later.
         assert_eq!(timer.next_event(), Some((100 + (1 << 32)) * 12));
+    }
+
+    /// The stamp timer with channel 4 latching OTG_FS's start of frame.
+    fn latching() -> Timer {
+        let mut timer = stamp_timer();
+        timer.write(0x50, 2 << 10, 0).unwrap();
+        timer.write(0x08, 1 << TS_SHIFT, 0).unwrap();
+        timer.write(0x1C, TRC << 8, 0).unwrap();
+        timer.write(0x20, 1 << 12, 0).unwrap();
+        timer
+    }
+
+    #[test]
+    fn a_trigger_latches_the_count_and_leaves_it_running() {
+        let mut timer = latching();
+        timer.remapped_trigger(2, 1211, 1300);
+        assert_eq!(timer.read(0x10, 1300).unwrap() & 0x1E1E, UIF << 4);
+        assert_eq!(timer.read(0x24, 1300).unwrap(), 108);
+        assert_eq!(timer.read(0x40, 1300).unwrap(), 100);
+        assert_eq!(timer.read(0x10, 1300).unwrap() & 0x1E1E, 0, "reading clears the flag");
+        for at in [2400, 3600] {
+            timer.remapped_trigger(2, at, at);
+        }
+        assert_eq!(timer.read(0x10, 3601).unwrap() & 0x1E1E, UIF << 4 | UIF << 12, "overcapture");
+        assert_eq!(timer.read(0x40, 3601).unwrap(), 300);
+    }
+
+    #[test]
+    fn a_trigger_latches_nothing_that_was_not_asked_for() {
+        for (offset, value) in [(0x50, 0), (0x08, 0), (0x1C, 0), (0x20, 0)] {
+            let mut timer = latching();
+            timer.write(offset, value, 0).unwrap();
+            timer.remapped_trigger(2, 1200, 1200);
+            assert_eq!(timer.read(0x10, 1200).unwrap() & 0x1E1E, 0, "{offset:#x}");
+            assert_eq!(timer.read(0x40, 1200).unwrap(), 0, "{offset:#x}");
+        }
+        let mut timer = latching();
+        timer.remapped_trigger(3, 1200, 1200);
+        assert_eq!(timer.read(0x40, 1200).unwrap(), 0, "another peripheral's");
     }
 
     #[test]

@@ -2,6 +2,21 @@
 
 use crate::otg::{InReply, OutReply};
 
+/// bRequest of the standard requests (USB 2.0, table 9-4).
+pub const GET_STATUS: u8 = 0;
+/// See [`GET_STATUS`].
+pub const CLEAR_FEATURE: u8 = 1;
+/// See [`GET_STATUS`].
+pub const SET_FEATURE: u8 = 3;
+/// See [`GET_STATUS`].
+pub const SET_CONFIGURATION: u8 = 9;
+/// See [`GET_STATUS`].
+pub const SET_INTERFACE: u8 = 11;
+/// Feature selectors (USB 2.0, 9.4).
+pub const ENDPOINT_HALT: u16 = 0;
+/// See [`ENDPOINT_HALT`].
+pub const DEVICE_REMOTE_WAKEUP: u16 = 1;
+
 /// A request on endpoint 0 (USB 2.0, 9.3).
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Request {
@@ -28,6 +43,45 @@ impl Request {
     /// A request that carries data to the device.
     pub fn with_data(kind: u8, request: u8, value: u16, index: u16, data: Vec<u8>) -> Self {
         Self { kind, request, value, index, length: data.len() as u16, data }
+    }
+
+    /// SET_CONFIGURATION.
+    pub fn set_configuration(value: u16) -> Self {
+        Self::new(0x00, SET_CONFIGURATION, value, 0, 0)
+    }
+
+    /// SET_INTERFACE to the only setting that CDC-ACM interfaces have.
+    pub fn set_interface(interface: u16) -> Self {
+        Self::new(0x01, SET_INTERFACE, 0, interface, 0)
+    }
+
+    /// SET_FEATURE(ENDPOINT_HALT) of the endpoint with this address, bit 7 for IN.
+    pub fn halt(endpoint: u8) -> Self {
+        Self::new(0x02, SET_FEATURE, ENDPOINT_HALT, endpoint.into(), 0)
+    }
+
+    /// CLEAR_FEATURE(ENDPOINT_HALT).
+    pub fn clear_halt(endpoint: u8) -> Self {
+        Self::new(0x02, CLEAR_FEATURE, ENDPOINT_HALT, endpoint.into(), 0)
+    }
+
+    /// GET_STATUS of an endpoint: two bytes, bit 0 of the first is set if it is halted.
+    pub fn endpoint_status(endpoint: u8) -> Self {
+        Self::new(0x82, GET_STATUS, 0, endpoint.into(), 2)
+    }
+
+    /// Whether pipes begin with DATA0 after it, on both sides.
+    pub fn restarts_pipes(&self) -> bool {
+        matches!(
+            (self.kind, self.request),
+            (0x00, SET_CONFIGURATION) | (0x01, SET_INTERFACE) | (0x02, CLEAR_FEATURE)
+        )
+    }
+
+    /// The request that a SETUP packet carries, with the data that goes with it.
+    pub fn from_setup(packet: [u8; 8], data: Vec<u8>) -> Self {
+        let word = |at: usize| u16::from_le_bytes([packet[at], packet[at + 1]]);
+        Self { kind: packet[0], request: packet[1], value: word(2), index: word(4), length: word(6), data }
     }
 
     fn reads(&self) -> bool {
@@ -93,6 +147,11 @@ impl Transfer {
     /// A transfer that has not begun.
     pub fn new(request: Request) -> Self {
         Self { request, stage: Stage::Setup, data1: true, moved: Vec::new(), sent: 0, silences: 0 }
+    }
+
+    /// What it asks.
+    pub fn request(&self) -> &Request {
+        &self.request
     }
 
     /// What to put on the bus. `packet` is endpoint 0's packet size.

@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 
 use super::control::{Outcome, Request, Step, Transfer};
 use super::descriptors::{CdcAcm, Device};
-use super::{Counters, EnumerationError};
+use super::{Counters, EnumerationError, HostDriver, Token};
 use crate::otg::{InReply, OutReply};
 
 mod enumeration;
@@ -38,24 +38,17 @@ pub struct Identity {
     pub strings: [String; 3],
 }
 
-/// What the driver wants on the bus.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(super) enum Token {
-    Setup([u8; 8]),
-    In { endpoint: u8, bulk: bool },
-    Out { endpoint: u8, data1: bool, bytes: Vec<u8> },
-}
-
 #[derive(Debug)]
 struct Pending {
     purpose: Purpose,
     transfer: Transfer,
+    request: Request,
     started: Option<u64>,
 }
 
 /// The driver's state.
 #[derive(Debug)]
-pub(super) struct Driver {
+pub struct Driver {
     address: u8,
     last_address: u8,
     ep0_packet: usize,
@@ -78,6 +71,10 @@ pub(super) struct Driver {
     lines_sent: bool,
     coding_set: bool,
     port_open: bool,
+    /// The device has a configuration, and the driver its interfaces.
+    bound: bool,
+    /// A bulk pipe that was found halted, by its address.
+    stalled: Option<u8>,
     in_data1: bool,
     out_data1: bool,
     notify_data1: bool,
@@ -95,7 +92,9 @@ pub(super) struct Driver {
 }
 
 impl Driver {
-    pub(super) fn new() -> Self {
+    /// Without a device.
+    #[allow(clippy::new_without_default, reason = "a driver belongs to a port, which makes it")]
+    pub fn new() -> Self {
         Self {
             address: 0,
             last_address: 0,
@@ -118,6 +117,8 @@ impl Driver {
             lines_sent: false,
             coding_set: false,
             port_open: false,
+            bound: false,
+            stalled: None,
             in_data1: false,
             out_data1: false,
             notify_data1: false,
@@ -132,23 +133,6 @@ impl Driver {
             outcomes: VecDeque::new(),
             enumerations: 0,
         }
-    }
-
-    /// The device is gone: the application's port with it. What was delivered stays readable.
-    pub(super) fn detach(&mut self) {
-        *self = Self {
-            last_address: self.last_address,
-            identity: self.identity.take(),
-            input: std::mem::take(&mut self.input),
-            reading: self.reading,
-            outcomes: std::mem::take(&mut self.outcomes),
-            enumerations: self.enumerations,
-            ..Self::new()
-        };
-    }
-
-    pub(super) fn address(&self) -> u8 {
-        self.address
     }
 
     pub(super) fn ready(&self) -> bool {
@@ -181,35 +165,66 @@ impl Driver {
         self.user.push_back(request);
     }
 
-    pub(super) fn take_reset_request(&mut self) -> bool {
+    /// Begins the control transfer that is due on a configured device, if any is.
+    fn begin_next(&mut self) {
+        if !self.configured || self.pending.is_some() {
+            return;
+        }
+        if let Some(address) = self.stalled.take() {
+            self.begin(Purpose::ClearHalt(address));
+        } else if self.bound && self.port_wanted != self.port_open {
+            let coding_first = self.port_wanted && !self.coding_set;
+            self.begin(if coding_first { Purpose::PutCoding } else { Purpose::Lines });
+        } else if !self.user.is_empty() {
+            self.begin(Purpose::User);
+        }
+    }
+}
+
+impl HostDriver for Driver {
+    fn detach(&mut self) {
+        *self = Self {
+            last_address: self.last_address,
+            identity: self.identity.take(),
+            input: std::mem::take(&mut self.input),
+            reading: self.reading,
+            outcomes: std::mem::take(&mut self.outcomes),
+            enumerations: self.enumerations,
+            ..Self::new()
+        };
+    }
+
+    fn address(&self) -> u8 {
+        self.address
+    }
+
+    fn take_reset_request(&mut self) -> bool {
         std::mem::take(&mut self.reset_request)
     }
 
-    /// Milliseconds of silence that the driver wants.
-    pub(super) fn take_pause(&mut self) -> Option<u64> {
+    fn take_pause(&mut self) -> Option<u64> {
         self.pause.take()
     }
 
     /// The port's reset is over: the first look, or what follows the second.
-    pub(super) fn after_reset(&mut self, second_wanted: bool) {
+    fn after_reset(&mut self, second_wanted: bool) {
         self.resets += 1;
         self.second_wanted = second_wanted;
         self.address = 0;
         self.begin(if self.resets == 1 { Purpose::FirstLook } else { Purpose::Address });
     }
 
-    pub(super) fn start_frame(&mut self) {
+    fn start_frame(&mut self) {
         self.notify_in = self.notify_in.saturating_sub(1);
     }
 
-    pub(super) fn restart_clock(&mut self) {
+    fn restart_clock(&mut self) {
         if let Some(pending) = &mut self.pending {
             pending.started = None;
         }
     }
 
-    /// Fails a control transfer that takes too long.
-    pub(super) fn check_time(&mut self, now: u64, limit: u64) {
+    fn check_time(&mut self, now: u64, limit: u64) {
         if let Some(pending) = &mut self.pending {
             let started = *pending.started.get_or_insert(now);
             if now - started > limit {
@@ -218,22 +233,7 @@ impl Driver {
         }
     }
 
-    /// Begins the control transfer that is due on a configured device, if any is.
-    fn begin_next(&mut self) {
-        if !self.configured || self.pending.is_some() {
-            return;
-        }
-        if self.port_wanted != self.port_open {
-            let coding_first = self.port_wanted && !self.coding_set;
-            self.begin(if coding_first { Purpose::PutCoding } else { Purpose::Lines });
-        } else if !self.user.is_empty() {
-            self.begin(Purpose::User);
-        }
-    }
-
-    /// The next transaction. `room` says whether the frame may carry another data packet on the bulk
-    /// pipes.
-    pub(super) fn choose(&mut self, room: bool) -> Option<Token> {
+    fn choose(&mut self, room: bool) -> Option<Token> {
         self.begin_next();
         if let Some(pending) = self.pending.as_ref().filter(|_| !self.deferred[0]) {
             return Some(match pending.transfer.step(self.ep0_packet) {
@@ -242,7 +242,13 @@ impl Driver {
                 Step::Out { data1, bytes } => Token::Out { endpoint: 0, data1, bytes },
             });
         }
-        let acm = self.acm.filter(|_| self.configured && self.port_open)?;
+        if self.stalled.is_some()
+            || self.pending.as_ref().is_some_and(|pending| pending.request.restarts_pipes())
+        {
+            // Nothing is under way on a pipe whose toggles are about to be reset.
+            return None;
+        }
+        let acm = self.acm.filter(|_| self.bound && self.configured && self.port_open)?;
         if self.notify_in == 0 {
             self.notify_in = u32::from(acm.notification.interval);
             return Some(Token::In { endpoint: acm.notification.number, bulk: false });
@@ -262,8 +268,7 @@ impl Driver {
         input.then_some(Token::In { endpoint: acm.input.number, bulk: true })
     }
 
-    /// A pipe said NAK: the others first.
-    pub(super) fn defer(&mut self, endpoint: u8, input: bool) {
+    fn defer(&mut self, endpoint: u8, input: bool) {
         let pipe = match (endpoint, input) {
             (0, _) => 0,
             (_, true) => 1,
@@ -275,17 +280,15 @@ impl Driver {
         }
     }
 
-    /// Whether there is anything to be tried again.
-    pub(super) fn any_deferred(&self) -> bool {
+    fn any_deferred(&self) -> bool {
         self.deferred.contains(&true)
     }
 
-    pub(super) fn clear_deferred(&mut self) {
+    fn clear_deferred(&mut self) {
         self.deferred = [false; 3];
     }
 
-    /// The answer to a SETUP or OUT packet; `pipe` is the length of a bulk packet.
-    pub(super) fn answered_out(&mut self, pipe: Option<usize>, reply: OutReply, counters: &mut Counters) {
+    fn answered_out(&mut self, pipe: Option<usize>, reply: OutReply, counters: &mut Counters) {
         let Some(length) = pipe else {
             let packet = self.ep0_packet;
             let outcome = self.pending.as_mut().and_then(|pending| pending.transfer.on_out(reply, packet));
@@ -299,12 +302,14 @@ impl Driver {
             }
             OutReply::Nak => {}
             OutReply::Silence => counters.silences += 1,
-            OutReply::Stall => counters.stalls += 1,
+            OutReply::Stall => {
+                counters.stalls += 1;
+                self.stalled = self.acm.map(|acm| acm.output.number);
+            }
         }
     }
 
-    /// The answer to an IN token.
-    pub(super) fn answered_in(
+    fn answered_in(
         &mut self,
         endpoint: u8,
         bulk: bool,
@@ -321,7 +326,11 @@ impl Driver {
             InReply::Data { data1, bytes } => (data1, bytes),
             InReply::Nak => return,
             InReply::Silence => return counters.silences += 1,
-            InReply::Stall => return counters.stalls += 1,
+            InReply::Stall => {
+                counters.stalls += 1;
+                self.stalled = Some(endpoint | 0x80);
+                return;
+            }
         };
         let expected = if bulk { &mut self.in_data1 } else { &mut self.notify_data1 };
         if data1 != *expected {

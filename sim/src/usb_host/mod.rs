@@ -6,23 +6,25 @@
 //! gives it (5.8.4: 19 packets of 64 bytes fit a frame), and a pipe that was answered with NAK is tried
 //! again after [`Timing::retry`].
 
-mod control;
+pub mod control;
 mod descriptors;
 mod driver;
+mod host_driver;
 mod timing;
 
-pub use control::{Outcome, Request};
+pub use control::{Outcome, Request, Step, Transfer};
 pub use descriptors::{CdcAcm, Device, Pipe};
-pub use driver::{Identity, LineCoding};
+pub use driver::{Driver as CdcDriver, Identity, LineCoding};
+pub use host_driver::{HostDriver, Token};
 pub use timing::Timing;
-
-use driver::{Driver, Token};
 
 use crate::CYCLES_PER_SECOND;
 use crate::otg::{InReply, Otg, OutReply};
 
 /// Cycles of one frame.
 const FRAME: u64 = CYCLES_PER_SECOND / 1000;
+/// The bits of a frame number in a SOF token (USB 2.0, 8.4.3).
+const FRAME_NUMBER: u32 = 0x7FF;
 /// Core cycles per USB bit.
 const BIT: u64 = CYCLES_PER_SECOND / 12_000_000;
 /// Bytes of bus time that a transaction takes beside its data (USB 2.0, 5.8.4, full-speed bulk).
@@ -112,12 +114,13 @@ pub struct Counters {
 #[derive(Debug)]
 struct Flight {
     token: Token,
+    begun: u64,
     until: u64,
 }
 
 /// The host.
 #[derive(Debug)]
-pub struct UsbHost {
+pub struct UsbHost<D = CdcDriver> {
     timing: Timing,
     bus: Bus,
     /// The cable is in, and the host has power.
@@ -126,20 +129,23 @@ pub struct UsbHost {
     /// When the device will have seen 3 ms of silence.
     idle_at: Option<u64>,
     frame_at: u64,
-    frame: u32,
+    /// Of the frame that starts then.
+    frame: u64,
+    /// When the last frame started, until somebody asks.
+    sof: Option<u64>,
     packets_this_frame: u32,
     flight: Option<Flight>,
     next_transaction: u64,
-    driver: Driver,
+    driver: D,
     /// Lose the handshake of every so-many-th IN packet.
     drop_handshake_every: Option<u64>,
     counters: Counters,
     now: u64,
 }
 
-impl UsbHost {
+impl<D: HostDriver> UsbHost<D> {
     /// A host without a device: the cable is out.
-    pub fn new(timing: Timing) -> Self {
+    pub fn new(timing: Timing, driver: D) -> Self {
         Self {
             timing,
             bus: Bus::Off,
@@ -148,10 +154,11 @@ impl UsbHost {
             idle_at: Some(IDLE),
             frame_at: 0,
             frame: 0,
+            sof: None,
             packets_this_frame: 0,
             flight: None,
             next_transaction: 0,
-            driver: Driver::new(),
+            driver,
             drop_handshake_every: None,
             counters: Counters::default(),
             now: 0,
@@ -230,6 +237,28 @@ impl UsbHost {
         }
     }
 
+    /// Loses the handshake of every `n`-th bulk IN packet, so that the device sends it again.
+    pub fn drop_handshake_every(&mut self, n: Option<u64>) {
+        self.drop_handshake_every = n;
+    }
+
+    /// Who chooses the transactions.
+    pub fn driver(&mut self) -> &mut D {
+        &mut self.driver
+    }
+
+    /// Takes back the transaction that is on the bus, as though it had not begun.
+    pub fn abandon_transaction(&mut self) {
+        self.flight = None;
+    }
+
+    /// Whether there are frames on the bus.
+    pub fn is_running(&self) -> bool {
+        self.bus == Bus::Running
+    }
+}
+
+impl UsbHost {
     /// An application opens the serial port: line coding, then DTR and RTS. Nothing is read before.
     pub fn open_port(&mut self) {
         self.driver.open_port();
@@ -276,11 +305,6 @@ impl UsbHost {
         self.driver.outcomes.pop_front()
     }
 
-    /// Loses the handshake of every `n`-th bulk IN packet, so that the device sends it again.
-    pub fn drop_handshake_every(&mut self, n: Option<u64>) {
-        self.drop_handshake_every = n;
-    }
-
     /// How far it has come.
     pub fn status(&self) -> Status {
         match (self.bus, self.driver.failure()) {
@@ -305,6 +329,13 @@ impl UsbHost {
     /// What was counted.
     pub fn counters(&self) -> Counters {
         Counters { enumerations: self.driver.enumerations, ..self.counters }
+    }
+}
+
+impl<D: HostDriver> UsbHost<D> {
+    /// What the bus counted.
+    pub fn bus_counters(&self) -> Counters {
+        self.counters
     }
 
     /// When [`Self::advance`] is to be called next.
@@ -366,7 +397,8 @@ impl UsbHost {
     fn run(&mut self, quiet: u64) {
         self.bus = Bus::Running;
         self.driver.restart_clock();
-        self.frame_at = self.now;
+        self.frame = self.timing.frame_after(self.now);
+        self.frame_at = self.timing.frame_start(self.frame).max(self.now);
         self.next_transaction = self.now + quiet;
     }
 
@@ -376,17 +408,26 @@ impl UsbHost {
             self.rest();
             return;
         }
-        self.frame_at += FRAME;
-        self.frame = self.frame.wrapping_add(1);
+        otg.start_of_frame(self.frame as u32 & FRAME_NUMBER);
+        self.sof = Some(self.now);
+        self.frame += 1;
+        self.frame_at = self.timing.frame_start(self.frame);
         self.packets_this_frame = 0;
         self.driver.start_frame();
-        otg.start_of_frame(self.frame);
+    }
+
+    /// When the last frame started, if one has since the last call.
+    pub fn take_sof(&mut self) -> Option<u64> {
+        self.sof.take()
     }
 
     /// Chooses a transaction and puts it on the bus, if it ends within the frame.
     fn take_off(&mut self, otg: &mut Otg) {
         let budget_left = self.packets_this_frame < self.timing.packets_per_frame;
         let Some(token) = self.driver.choose(budget_left) else {
+            if self.obey_driver(otg) {
+                return;
+            }
             // Pipes that said NAK are tried again soon; without any, there is nothing to do in this
             // frame.
             let retry = budget_left && self.driver.any_deferred();
@@ -409,16 +450,17 @@ impl UsbHost {
             self.next_transaction = self.frame_at;
             return;
         }
-        self.flight = Some(Flight { token, until });
+        self.flight = Some(Flight { token, begun: self.now, until });
     }
 
     /// The transaction on the bus ends.
     fn land(&mut self, otg: &mut Otg) {
-        let Some(Flight { token, .. }) = self.flight.take() else {
+        let Some(Flight { token, begun, .. }) = self.flight.take() else {
             return;
         };
         let address = self.driver.address();
-        self.next_transaction = self.now;
+        let periodic = matches!(token, Token::In { endpoint, bulk: false } if endpoint != 0);
+        self.next_transaction = if periodic { self.now } else { self.now.max(begun + self.timing.split) };
         match token {
             Token::Setup(packet) => {
                 let reply = otg.setup(address, packet);
@@ -443,12 +485,20 @@ impl UsbHost {
                 self.driver.answered_in(endpoint, bulk, reply, self.timing.read_bytes, &mut self.counters);
             }
         }
+        self.obey_driver(otg);
+        self.driver.check_time(self.now, self.timing.control_timeout);
+    }
+
+    /// Resets the device or is silent for a while, if the driver wants that; whether it did.
+    fn obey_driver(&mut self, otg: &mut Otg) -> bool {
         if self.driver.take_reset_request() {
             self.begin_reset(otg);
         } else if let Some(pause) = self.driver.take_pause() {
             self.next_transaction = self.now + pause * FRAME;
+        } else {
+            return false;
         }
-        self.driver.check_time(self.now, self.timing.control_timeout);
+        true
     }
 
     /// A pipe that said NAK waits until the others had their turn.

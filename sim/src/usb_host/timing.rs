@@ -26,7 +26,19 @@ pub struct Timing {
     /// Bytes that a read of the bulk IN pipe asks for: it completes when they are there or with a
     /// packet that is not full. Linux asks for 128 (cdc-acm: two packets), Windows for up to 4096.
     pub read_bytes: usize,
+    /// How much faster the board's crystal runs than this host's, in parts per million: its frames then have so much more of the
+    /// board's cycles.
+    pub board_ppm: f64,
+    /// How far a start of frame may be from its place, in board cycles; the same for the same frame, whatever the board. USB 2.0
+    /// (7.1.12) allows a full-speed host ±500 ns from one to the next.
+    pub sof_jitter: u64,
+    /// Behind a high-speed hub: the least time from one control or bulk transaction to the next. There a transaction is split into
+    /// what begins it and what fetches its result, in different microframes. 0 on a root port.
+    pub split: u64,
 }
+
+/// Cycles of a microframe: 125 us.
+const MICROFRAME: u64 = FRAME / 8;
 
 impl Default for Timing {
     fn default() -> Self {
@@ -40,14 +52,55 @@ impl Default for Timing {
             second_reset: true,
             packets_per_frame: 19,
             read_bytes: 128,
+            board_ppm: 0.0,
+            sof_jitter: 0,
+            split: 0,
         }
     }
 }
 
 impl Timing {
+    /// The board cycle at which frame `number` starts. Frame 0 starts with the board's power-on, on every board, so that
+    /// boards that are switched on together are on one controller.
+    pub fn frame_start(&self, number: u64) -> u64 {
+        let place = number as f64 * self.frame_cycles();
+        let jitter = self.sof_jitter as f64 * (2.0 * even(number) - 1.0);
+        (place + jitter).max(0.0) as u64
+    }
+
+    /// The first frame that has its place at or after a board cycle.
+    pub fn frame_after(&self, cycle: u64) -> u64 {
+        (cycle as f64 / self.frame_cycles()).ceil() as u64
+    }
+
+    /// Board cycles of a frame.
+    fn frame_cycles(&self) -> f64 {
+        FRAME as f64 * self.board_rate()
+    }
+
+    /// Board cycles in the time of one cycle of a board whose crystal is exact.
+    pub fn board_rate(&self) -> f64 {
+        1.0 + self.board_ppm * 1e-6
+    }
+
     /// The shortest times that the standard allows, and debouncing cut short: for tests that plug a
     /// device in hundreds of times.
     pub fn hasty() -> Self {
         Self { debounce: 5 * FRAME, reset: 10 * FRAME, recovery: FRAME, ..Self::default() }
     }
+
+    /// Behind a high-speed hub, with a host that begins a transaction when it has fetched the one before, so that each
+    /// takes so many microframes. Hubs have room for more than one; a host that uses it is faster.
+    #[must_use]
+    pub fn behind_hub(self, microframes: u32) -> Self {
+        Self { split: u64::from(microframes) * MICROFRAME, ..self }
+    }
+}
+
+/// A number from 0 to 1 that looks random and is always the same for the same `number` (SplitMix64's mixing function).
+fn even(number: u64) -> f64 {
+    let mut bits = number.wrapping_add(0x9E37_79B9_7F4A_7C15);
+    bits = (bits ^ bits >> 30).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    bits = (bits ^ bits >> 27).wrapping_mul(0x94D0_49BB_1331_11EB);
+    (bits ^ bits >> 31) as f64 / u64::MAX as f64
 }

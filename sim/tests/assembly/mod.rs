@@ -1,8 +1,8 @@
 #![allow(dead_code, reason = "each test uses its part")]
 //! A few Thumb instructions by hand, for programs too small to need a compiler.
 
-use cantap_sim::Image;
 use cantap_sim::memory_map::{FLASH, SRAM};
+use cantap_sim::{Image, Peripheral};
 
 /// The condition EQ.
 pub const EQ: u16 = 0;
@@ -144,4 +144,42 @@ pub const fn nop() -> u16 {
 /// `UDF #0`.
 pub const fn udf() -> u16 {
     0xDE00
+}
+
+/// A device that asserts its interrupt from a moment on until it is written to.
+pub struct Alarm {
+    at: Option<u64>,
+    asserted: bool,
+}
+
+impl Alarm {
+    /// Asserts it at core cycle `at`, if ever.
+    pub fn new(at: Option<u64>) -> Self {
+        Self { at, asserted: false }
+    }
+}
+
+impl Peripheral for Alarm {
+    fn read(&mut self, _offset: u32, _size: u8, _now: u64) -> u32 {
+        0
+    }
+
+    fn write(&mut self, _offset: u32, _size: u8, _value: u32, _now: u64) {
+        self.asserted = false;
+    }
+
+    fn irq(&self) -> bool {
+        self.asserted
+    }
+
+    fn next_event(&self) -> Option<u64> {
+        self.at
+    }
+
+    fn advance(&mut self, now: u64) {
+        if self.at.is_some_and(|at| at <= now) {
+            self.at = None;
+            self.asserted = true;
+        }
+    }
 }

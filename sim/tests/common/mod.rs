@@ -4,11 +4,33 @@
 use std::path::{Path, PathBuf};
 
 use cantap_sim::elf::Image;
+use cantap_sim::machine::Setup;
+use cantap_sim::timing::Bound;
 
 /// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it. Without either, says
 /// so loudly and returns nothing, and the test has shown nothing.
 pub fn firmware() -> Option<Image> {
     let path = elf()?;
+    Some(Image::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+}
+
+/// A board's name, its crystal's frequency in Hz, and where each channel's TX is: port (0 is A) and pin.
+pub type BoardFacts = (&'static str, u64, [(usize, u32); 2]);
+
+/// The boards.
+pub const BOARDS: [BoardFacts; 3] = [
+    ("olimex-p405", 8_000_000, [(1, 9), (1, 6)]),
+    ("feather-f405", 12_000_000, [(1, 9), (1, 13)]),
+    ("stm32f4-discovery", 8_000_000, [(3, 1), (1, 13)]),
+];
+
+/// A board's ELF, which lies beside the default board's.
+pub fn board(name: &str) -> Option<Image> {
+    let path = elf()?.with_file_name(format!("cantap-{name}.elf"));
+    if !path.exists() {
+        eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware --all` first", path.display());
+        return None;
+    }
     Some(Image::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }
 
@@ -23,4 +45,17 @@ pub fn elf() -> Option<PathBuf> {
     }
     eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware` first", built.display());
     None
+}
+
+/// How long memories and buses keep the core waiting in a test that does not choose: `CANTAP_TIMING` (`best` or `worst`), or
+/// the best.
+pub fn bound() -> Bound {
+    std::env::var("CANTAP_TIMING").map_or(Bound::Best, |text| {
+        text.parse().unwrap_or_else(|reason| panic!("CANTAP_TIMING={text}: {reason}"))
+    })
+}
+
+/// The default board under [`bound`].
+pub fn setup() -> Setup {
+    Setup { bound: bound(), ..Setup::default() }
 }

@@ -4,7 +4,7 @@ use heapless::Vec;
 
 use super::{Filter, MAX_SEND, Refusal, Reply, TxFrame};
 use crate::Channel;
-use crate::frame::{Packed, take_packed};
+use crate::packed::{Packed, take_packed};
 use crate::varint::{take_u32, take_u64};
 
 /// The index of [`super::Command::Send`], as the pinned bytes have it.

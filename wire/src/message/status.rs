@@ -1,5 +1,6 @@
 //! How a device and its channels are.
 
+use heapless::String;
 use serde::{Deserialize, Serialize};
 
 use super::ChannelConfig;
@@ -52,6 +53,18 @@ pub struct ChannelStatus {
     pub transmit_failures: u32,
     /// Frames waiting in the transmit queue.
     pub tx_pending: u16,
+}
+
+/// Longest text of a failure, in bytes: a panic's place and a sentence.
+pub const MAX_FAILURE_TEXT: usize = 200;
+
+/// Starts that followed a failure of the firmware: a panic, a fault, the watchdog, a clock that did not come up.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Failures {
+    /// How many since the device got its power.
+    pub count: u32,
+    /// What the last one was, in words for a developer; empty if there was none.
+    pub last: String<MAX_FAILURE_TEXT>,
 }
 
 /// A controller's registers (RM0090, "bxCAN registers").

@@ -20,6 +20,7 @@ pub struct TxFrame {
     /// Comes back in [`crate::Event::Transmitted`] or [`crate::Event::TransmitFailed`]. Below [`DEVICE_TAG`].
     pub tag: u32,
     /// The frame.
+    #[serde(with = "crate::packed")]
     pub frame: Frame,
     /// Device time, in ticks, before which it is not sent. The queue keeps its order: a later frame
     /// waits for an earlier one.
@@ -30,6 +31,7 @@ pub struct TxFrame {
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Periodic {
     /// The frame, before modifiers.
+    #[serde(with = "crate::packed")]
     pub frame: Frame,
     /// Ticks between two transmissions' due times. No drift: due times are multiples.
     pub period_ticks: u32,
@@ -82,6 +84,7 @@ pub struct Trigger {
     /// What starts it.
     pub filter: Filter,
     /// What is sent.
+    #[serde(with = "crate::packed")]
     pub reply: Frame,
     /// How many times; 0 means for ever.
     pub count: u32,

@@ -1,4 +1,5 @@
-//! What the firmware does to a bus on request, measured on the emulated bus: replies, periods, times, load.
+//! What the firmware does to a bus on request, measured on the emulated bus under both bounds of time
+//! (`docs/emulator.md`): replies, periods, times, load. Each cell has the best, then the worst.
 
 use anyhow::{Context, Result};
 use cantap_sim::Image;
@@ -6,57 +7,102 @@ use cantap_sim::drive::{self, Range};
 use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::stream::{self, Filled, Replayed};
+use cantap_sim::timing::Bound;
 use cantap_sim::traffic::{Kind, Traffic};
 use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
 use cantap_wire::Channel::{Can1, Can2};
 
+use super::Extent;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;
 /// Bus time of each replay, and of each bus that is filled.
-const SECONDS: f64 = 0.3;
+const BUS_MS: u64 = 300;
+
+/// What channel 2 does meanwhile.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Other {
+    /// It is closed.
+    Idle,
+    /// It receives all that a bus can carry.
+    Full,
+    /// It takes part in a bus of its own and does the same as channel 1.
+    Joined,
+}
+
+impl Other {
+    /// The channels that take part.
+    fn channels(self) -> &'static [Channel] {
+        if self == Self::Joined { &Channel::ALL } else { &[Can1] }
+    }
+}
 
 /// Measures with the other channel idle, full, and doing the same.
-pub fn run() -> Result<()> {
-    println!("bus: channel 1 at 1 Mbit/s on the emulated board");
-    println!("{:<42} {:>18} {:>18} {:>18}", "", "channel 2 idle", "channel 2 full", "both alike");
-    let line = |name: &str, cells: [String; 3]| {
-        let [idle, full, both] = cells;
-        println!("{name:<42} {idle:>18} {full:>18} {both:>18}");
-    };
-    let one = |measure: &dyn Fn(&mut Rig) -> Result<String>| -> Result<[String; 3]> {
-        Ok([measure(&mut rig(Other::Idle)?)?, measure(&mut rig(Other::Full)?)?, String::new()])
-    };
-    line("reply after the frame's end, us", one(&|rig| Ok(range(drive::reply_latency(rig)?)))?);
-    line("period of 1 ms off by, us", one(&|rig| Ok(range(drive::periodic_jitter(rig, 1000)?)))?);
-    // Three tenths of a second: each entry's frame about sixty times.
-    let tables = drive::periodic_tables(&mut rig(Other::Joined)?, 5_000, 300_000)?;
-    let tables = tables.filter(|tables| tables.wrong == 0).map(|tables| tables.late);
-    line("32 periods of 5.0 to 5.4 ms, late, us", [String::new(), String::new(), range(tables)]);
+pub fn run(extent: &Extent) -> Result<()> {
+    println!("bus: channel 1 at 1 Mbit/s on the emulated board; each at best / at worst");
+    println!("{:<40} {:>28} {:>28} {:>22}", "", "channel 2 idle", "channel 2 full", "both alike");
+    let alone = &[Other::Idle, Other::Full][..];
+    let all = &[Other::Idle, Other::Full, Other::Joined][..];
+    let ms = extent.shortened(BUS_MS);
+    let seconds = ms as f64 / 1000.0;
+    rows(extent, ["reply after the frame's end, us"], alone, |rig, _| {
+        Ok([range(drive::reply_latency(rig)?)])
+    })?;
+    rows(extent, ["period of 1 ms off by, us"], alone, |rig, _| {
+        Ok([range(drive::periodic_jitter(rig, 1000)?)])
+    })?;
+    // In three tenths of a second each entry's frame is sent about sixty times.
+    rows(extent, ["32 periods of 5.0 to 5.4 ms, late, us"], &[Other::Joined], |rig, _| {
+        let tables = drive::periodic_tables(rig, 5_000, 1000 * ms)?;
+        Ok([range(tables.filter(|tables| tables.wrong == 0).map(|tables| tables.late))])
+    })?;
     for load in [10.0, 30.0, 60.0, 90.0, 98.0] {
-        let measure = |other| -> Result<Option<Vec<Replayed>>> {
-            let channels = if other == Other::Joined { &Channel::ALL[..] } else { &[Can1] };
-            Ok(stream::replay(&mut rig(other)?, channels, load, SECONDS)?)
-        };
-        let replays = [measure(Other::Idle)?, measure(Other::Full)?, measure(Other::Joined)?];
-        let spacing = |replayed: &Option<Vec<Replayed>>| {
-            worst(replayed.as_deref(), |one| one.late.width_us(), |us| format!("{us:.2}"))
-        };
-        let stamps = |replayed: &Option<Vec<Replayed>>| {
-            worst(replayed.as_deref(), |one| one.stamps.max_us, |us| format!("{us:.2}"))
-        };
-        line(&format!("spacing of a replay at {load} % off by, us"), replays.each_ref().map(spacing));
-        line("  its confirmations' stamps late by, us", replays.each_ref().map(stamps));
+        let spacing = format!("spacing of a replay at {load} % off by, us");
+        let stamps = format!("stamps of a replay at {load} % late by, us");
+        rows(extent, [&spacing, &stamps], all, |rig, other| {
+            let replayed: Option<Vec<Replayed>> = stream::replay(rig, other.channels(), load, seconds)?;
+            let replayed = replayed.as_deref();
+            let text = |us: f64| format!("{us:.2}");
+            Ok([
+                greatest(replayed, |one| one.late.width_us(), text),
+                greatest(replayed, |one| one.stamps.max_us, text),
+            ])
+        })?;
     }
     for (name, kind) in [("8 bytes", Kind::Std8), ("no data", Kind::Std0)] {
-        let measure = |other| -> Result<String> {
-            let channels = if other == Other::Joined { &Channel::ALL[..] } else { &[Can1] };
-            let filled: Option<Vec<Filled>> = stream::fill(&mut rig(other)?, channels, kind, SECONDS)?;
-            Ok(worst(filled.as_deref(), |one| -one.load_percent, |load| format!("{:.2}", -load)))
-        };
-        let cells = [measure(Other::Idle)?, measure(Other::Full)?, measure(Other::Joined)?];
-        line(&format!("load by streamed frames, {name}, %"), cells);
+        let name = format!("load by streamed frames, {name}, %");
+        rows(extent, [&name], all, |rig, other| {
+            let filled: Option<Vec<Filled>> = stream::fill(rig, other.channels(), kind, seconds)?;
+            Ok([greatest(filled.as_deref(), |one| -one.load_percent, |load| format!("{:.2}", -load))])
+        })?;
+    }
+    Ok(())
+}
+
+/// Prints rows that one measurement fills, if one of them is wanted.
+fn rows<const N: usize>(
+    extent: &Extent,
+    names: [&str; N],
+    others: &[Other],
+    measure: impl Fn(&mut Rig, Other) -> Result<[String; N]>,
+) -> Result<()> {
+    if !names.iter().any(|name| extent.wants(name)) {
+        return Ok(());
+    }
+    let mut cells: [[String; 3]; N] = std::array::from_fn(|_| Default::default());
+    for &other in others {
+        let mut measured = Vec::new();
+        for bound in Bound::ALL {
+            measured.push(measure(&mut rig(other, bound)?, other)?);
+        }
+        for (row, cells) in cells.iter_mut().enumerate() {
+            let both: Vec<&str> = measured.iter().map(|figures| figures[row].as_str()).collect();
+            cells[other as usize] = both.join(" / ");
+        }
+    }
+    for (name, [idle, full, both]) in names.iter().zip(&cells) {
+        println!("{name:<40} {idle:>28} {full:>28} {both:>22}");
     }
     Ok(())
 }
@@ -66,30 +112,19 @@ fn range(range: Option<Range>) -> String {
 }
 
 /// The greatest of a figure over the channels, as text.
-fn worst<T>(measured: Option<&[T]>, figure: impl Fn(&T) -> f64, text: impl Fn(f64) -> String) -> String {
+fn greatest<T>(measured: Option<&[T]>, figure: impl Fn(&T) -> f64, text: impl Fn(f64) -> String) -> String {
     let figures = measured.map(|measured| measured.iter().map(figure));
     figures.and_then(|figures| figures.reduce(f64::max)).map_or("incomplete".to_owned(), text)
 }
 
-/// What channel 2 does meanwhile.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Other {
-    /// It is closed.
-    Idle,
-    /// It receives all that a bus can carry.
-    Full,
-    /// It takes part in a bus of its own, as channel 1 does.
-    Joined,
-}
-
 /// A board with channel 1 on its bus.
-fn rig(other: Other) -> Result<Rig> {
+fn rig(other: Other, bound: Bound) -> Result<Rig> {
     let elf = Board::ALL[0].elf();
     let image =
         Image::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
-    let mut rig = Rig::new(image, Setup::default(), Timing::default());
+    let mut rig = Rig::new(image, Setup { bound, ..Setup::default() }, Timing::default());
     rig.connect()?;
-    stream::join(&mut rig, if other == Other::Joined { &Channel::ALL } else { &[Can1] })?;
+    stream::join(&mut rig, other.channels())?;
     if other == Other::Full {
         rig.listen(Can2, BITRATE_BPS)?;
         let from = rig.now();

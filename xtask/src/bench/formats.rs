@@ -6,14 +6,14 @@ use std::path::{Path, PathBuf};
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
-use cantap::formats::{ReadOptions, WriteOptions, create_writer, open_reader};
+use cantap_formats::{ReadOptions, WriteOptions, create_writer, open_reader};
 use xshell::{Shell, cmd};
 
 use crate::peers::Peers;
 use crate::workspace;
 
 /// Some ten thousand frames of an NMEA 2000 bus, recorded by candump.
-const RECORDING: &str = "host/tests/data/nmea2000.log.gz";
+const RECORDING: &str = "host/formats/tests/data/nmea2000.log.gz";
 /// Frames of the trace made of it.
 const FRAMES: u64 = 1_000_000;
 /// Ours and log2asc take turns so often, and the best of each counts. python-can takes longer than the machine's moods.

@@ -6,6 +6,8 @@
 #[cfg(feature = "bench")]
 mod bus;
 #[cfg(feature = "bench")]
+mod clock;
+#[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
 mod formats;
@@ -41,6 +43,8 @@ enum Subject {
     Emulated,
     /// Replies, periods, replay and load on the emulated bus.
     Bus,
+    /// Device time to UTC, and two boards' times to one another.
+    Clock,
     /// Frames per second that the host decodes, tightens and places in time.
     Host,
     /// Frames per second whose load, periods and losses are measured.
@@ -57,6 +61,12 @@ pub struct Args {
     /// How long the live view is watched.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
+    /// Of what is measured on the emulated board, only the rows whose names contain this.
+    #[arg(long, value_name = "TEXT", default_value = "")]
+    rows: String,
+    /// Measure on the emulated board for a tenth of the time: figures that are good enough to work by.
+    #[arg(long)]
+    quick: bool,
 }
 
 /// Builds this program in release and measures there.
@@ -68,13 +78,35 @@ pub fn run(args: &Args) -> Result<()> {
     let subjects = args.subject.iter().filter_map(Subject::to_possible_value);
     let seconds = args.seconds.to_string();
     let subjects: Vec<String> = subjects.map(|subject| subject.get_name().to_owned()).collect();
+    let rows = &args.rows;
+    let quick = args.quick.then_some("--quick");
     cmd!(
         shell,
-        "cargo run --release --quiet -p xtask --features bench -- bench {subjects...} --seconds {seconds}"
+        "cargo run --release --quiet -p xtask --features bench -- bench {subjects...} --seconds {seconds} --rows {rows} {quick...}"
     )
     .quiet()
     .run()?;
     Ok(())
+}
+
+/// How much of what the emulated board can be asked is measured.
+#[cfg(feature = "bench")]
+struct Extent<'a> {
+    rows: &'a str,
+    quick: bool,
+}
+
+#[cfg(feature = "bench")]
+impl Extent<'_> {
+    /// Whether the row of this name is wanted.
+    fn wants(&self, row: &str) -> bool {
+        row.contains(self.rows)
+    }
+
+    /// A time, or what is left of it if it must be quick.
+    fn shortened(&self, time: u64) -> u64 {
+        if self.quick { time / 10 } else { time }
+    }
 }
 
 /// Measures.
@@ -82,6 +114,7 @@ pub fn run(args: &Args) -> Result<()> {
 pub fn run(args: &Args) -> Result<()> {
     use clap::ValueEnum;
 
+    let extent = Extent { rows: &args.rows, quick: args.quick };
     let subjects = if args.subject.is_empty() { Subject::value_variants() } else { &args.subject };
     for subject in subjects {
         match subject {
@@ -89,8 +122,9 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Formats => formats::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,
-            Subject::Emulated => emulated::run()?,
-            Subject::Bus => bus::run()?,
+            Subject::Emulated => emulated::run(&extent)?,
+            Subject::Bus => bus::run(&extent)?,
+            Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
             Subject::Monitor => monitor::run(args.seconds)?,

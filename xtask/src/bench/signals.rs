@@ -5,14 +5,14 @@ use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
 use cantap::Frame;
-use cantap::signals::{Decoder, Source, dbc};
+use cantap_signals::{Decoder, Source, dbc};
 use xshell::cmd;
 
 use crate::peers::Peers;
 use crate::workspace;
 
 /// A car's database: 217 messages.
-const DATABASE: &str = "host/tests/data/dbc/vehicle.dbc";
+const DATABASE: &str = "host/signals/tests/data/dbc/vehicle.dbc";
 /// Random payloads per message.
 const PAYLOADS: u64 = 50;
 /// How often cantools decodes all frames; about a second.
@@ -65,7 +65,7 @@ pub fn run() -> Result<()> {
 }
 
 /// Random payloads that every program makes the same way.
-fn frames_of(message: &cantap::signals::Message) -> Vec<Frame> {
+fn frames_of(message: &cantap_signals::Message) -> Vec<Frame> {
     let payload = |number: u64| {
         let mut random = (u64::from(message.id.raw()) << 32 | number).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         random ^= random >> 29;

@@ -3,8 +3,8 @@
 use std::time::Instant;
 
 use anyhow::{Result, ensure};
-use cantap::stats::{Options, Statistics};
-use cantap::{Direction, Frame, Id, TraceEvent, TraceRecord};
+use cantap_analysis::stats::{Options, Statistics};
+use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
 
 /// Frames in one round.
 const FRAMES: usize = 1 << 20;

@@ -24,7 +24,7 @@ pub struct Kind {
     pub name: &'static str,
     extended: bool,
     len: usize,
-    ticks: i32,
+    ticks: i64,
     /// Most bytes per frame that the design allows (for ext0, that of ext8 less its data).
     budget: f64,
 }

@@ -3,7 +3,7 @@
 use std::borrow::Cow;
 use std::io::{self, Write};
 
-use super::{Decoded, Seconds};
+use super::decoded::{Decoded, Seconds};
 
 pub fn write_header(out: &mut impl Write) -> io::Result<()> {
     out.write_all(b"time,channel,id,message,signal,value,unit,text\r\n")

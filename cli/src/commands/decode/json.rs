@@ -2,7 +2,7 @@
 
 use std::io::{self, Write};
 
-use super::{Decoded, Seconds};
+use super::decoded::{Decoded, Seconds};
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     let Decoded { record, frame, message, values } = decoded;

@@ -2,9 +2,9 @@
 
 use std::io::{self, Write};
 
-use cantap::signals::{Message, SignalValue};
+use cantap_signals::{Message, SignalValue};
 
-use super::{Decoded, Seconds};
+use super::decoded::{Decoded, Seconds};
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     let Decoded { record, frame, message, values } = decoded;

@@ -1,42 +1,40 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
 use std::io::IsTerminal;
-use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use std::time::{SystemTime, UNIX_EPOCH};
 
 use anyhow::{Context, bail};
-use cantap::device::Records;
-use cantap::stats::{Statistics, Window};
-use cantap::{Address, Device, TraceRecord};
+use cantap_analysis::stats::{Statistics, Window};
 
 use super::Args;
 use super::table::remarks;
 use super::windows::Windows;
-use crate::interrupt;
+use crate::address::Address;
+use crate::live::LiveRecords;
 
-/// How long to wait for records before looking at clock and Ctrl-C.
-const WAIT: Duration = Duration::from_millis(100);
 /// A window is closed so long after its end, so that what is still on the way gets into it.
 const LATENESS_NS: i64 = 1_000_000_000;
 /// Columns of the bar for 100 %.
 const BAR_COLUMNS: usize = 20;
 
-/// Listens until Ctrl-C or the end of the time.
+/// Listens until Ctrl-C or the end of the time. What was heard counts, even where this fails.
 pub(super) fn run(
     args: &Args,
     address: &Address,
     statistics: &mut Statistics,
     windows: &mut Option<Windows>,
 ) -> anyhow::Result<()> {
-    interrupt::watch()?;
-    let device = Device::open(address)?;
-    let mut records = device.records();
     let options = args.options();
-    for channel in args.channel.iter() {
-        let Some(bitrate) = options.bitrate_of(channel.number()) else {
-            bail!("channel {0} has no bit rate; give one with -b, such as -b {0}:500k", channel.number());
-        };
-        device.listen(channel, bitrate).with_context(|| format!("channel {}", channel.number()))?;
-    }
+    let channels = args.channel;
+    let mut live = LiveRecords::open(address, args.time, move |device| {
+        for channel in channels.iter() {
+            let Some(bitrate) = options.bitrate_of(channel.number()) else {
+                bail!("channel {0} has no bit rate; give one with -b, such as -b {0}:500k", channel.number());
+            };
+            device.listen(channel, bitrate).with_context(|| format!("channel {}", channel.number()))?;
+        }
+        Ok(())
+    })?;
     let mut show = Lines::new(!args.json);
     let mut keep = |window: &Window| {
         show.window(window);
@@ -44,32 +42,20 @@ pub(super) fn run(
             windows.push(window);
         }
     };
-    let start = Instant::now();
-    while !interrupt::requested() && args.time.is_none_or(|time| start.elapsed() < time) {
-        let Some(batch) = records.next_batch(WAIT)? else {
-            break;
-        };
-        push_all(batch, &records, statistics, &mut keep);
+    let mut batch = Vec::new();
+    let ended = loop {
+        match live.next_batch(&mut batch) {
+            Ok(true) => {}
+            Ok(false) => break Ok(()),
+            Err(error) => break Err(error),
+        }
+        for record in &batch {
+            statistics.push_with(record, &mut keep);
+        }
         statistics.advance_with(now_ns().saturating_sub(LATENESS_NS), &mut keep);
-    }
-    device.stop()?;
-    while let Some(batch) = records.next_batch(WAIT)? {
-        push_all(batch, &records, statistics, &mut keep);
-    }
+    };
     statistics.finish_with(&mut keep);
-    Ok(())
-}
-
-fn push_all(
-    batch: Vec<TraceRecord>,
-    records: &Records,
-    statistics: &mut Statistics,
-    keep: &mut impl FnMut(&Window),
-) {
-    for record in &batch {
-        statistics.push_with(record, &mut *keep);
-    }
-    records.recycle(batch);
+    ended
 }
 
 /// The machine's UTC time, which the device's is mapped to.

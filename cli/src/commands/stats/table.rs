@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use cantap::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
+use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
 /// Everything, for a terminal of any width above eighty columns.
 pub(super) fn text(summary: &Summary, per_id: bool) -> String {

@@ -5,7 +5,7 @@ use std::fs::File;
 use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
 
 use anyhow::Context;
-use cantap::stats::{PeakSummary, Window};
+use cantap_analysis::stats::{PeakSummary, Window};
 
 /// Windows in the order in which they were closed.
 pub(super) struct Windows {

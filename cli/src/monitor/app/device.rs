@@ -1,12 +1,13 @@
 //! Another device, other bit rates, another mode.
 
-use cantap::Address;
-use cantap::stats::Statistics;
 use cantap::wire::message::Mode;
+use cantap_analysis::stats::Statistics;
 
 use super::super::model::{LOAD_WINDOW, Model};
 use super::super::source::{Order, Plan};
-use super::{App, PromptKind};
+use super::line::PromptKind;
+use super::state::App;
+use crate::address::{Address, AddressError};
 use crate::channel_bitrate::ChannelBitrate;
 
 impl App {
@@ -54,7 +55,7 @@ impl App {
     }
 
     pub(super) fn set_device(&mut self, text: &str, model: &Model) -> Result<(), String> {
-        let address: Address = text.parse().map_err(|error: cantap::DeviceError| error.to_string())?;
+        let address: Address = text.parse().map_err(|error: AddressError| error.to_string())?;
         let plan = match &self.plan {
             Some(plan) => Plan { address, ..plan.clone() },
             None => Plan::listening(address, model.options()),
@@ -63,7 +64,8 @@ impl App {
     }
 
     fn open(&mut self, plan: Plan, model: &Model) -> Result<(), String> {
-        let options = cantap::stats::Options { window: LOAD_WINDOW, ..plan.options(model.options()) };
+        let options =
+            cantap_analysis::stats::Options { window: LOAD_WINDOW, ..plan.options(model.options()) };
         Statistics::new(options).map_err(|error| error.to_string())?;
         self.plan = Some(plan.clone());
         self.order(Order::Open(plan));

@@ -5,8 +5,8 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, Mo
 use super::super::model::Model;
 use super::super::source::Order;
 use super::super::views::{self, trace};
-use super::search::Direction;
-use super::{App, Flow, PromptKind, View};
+use super::line::PromptKind;
+use super::state::{App, Direction, Flow, View};
 
 /// The row where a page's own rows begin, its heading.
 const BODY_ROW: u16 = 2;

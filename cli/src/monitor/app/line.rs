@@ -55,6 +55,34 @@ impl Line {
     }
 }
 
+/// What a line of input is for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum PromptKind {
+    /// Text to look for in the trace.
+    Search,
+    /// Filters in candump's syntax.
+    Filter,
+    /// A file to record to.
+    Record,
+    /// A frame or message to send, with its period.
+    Send,
+    /// Bit rates.
+    BitRate,
+    /// A device.
+    Device,
+}
+
+/// A line of input.
+#[derive(Clone, Debug)]
+pub struct Prompt {
+    /// What for.
+    pub kind: PromptKind,
+    /// What was typed.
+    pub line: Line,
+    /// The entry of the send list that it edits.
+    pub entry: Option<usize>,
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -1,43 +1,16 @@
-//! Lines of input: what is asked for, and what becomes of the answer.
+//! What becomes of what was typed into a line of input.
 
 use std::path::Path;
 
-use cantap::filter::Filter;
+use cantap_trace::filter::Filter;
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
 use super::super::recorder;
 use super::super::source::Order;
-use super::search::Direction;
-use super::{App, Line, parse_entry};
-
-/// What a line of input is for.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum PromptKind {
-    /// Text to look for in the trace.
-    Search,
-    /// Filters in candump's syntax.
-    Filter,
-    /// A file to record to.
-    Record,
-    /// A frame or message to send, with its period.
-    Send,
-    /// Bit rates.
-    BitRate,
-    /// A device.
-    Device,
-}
-
-/// A line of input.
-#[derive(Clone, Debug)]
-pub struct Prompt {
-    /// What for.
-    pub kind: PromptKind,
-    /// What was typed.
-    pub line: Line,
-    /// The entry of the send list that it edits.
-    pub entry: Option<usize>,
-}
+use super::entry::parse_entry;
+use super::line::{Prompt, PromptKind};
+use super::state::{App, Direction};
 
 impl App {
     pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {

@@ -3,7 +3,7 @@
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
-use super::App;
+use super::state::App;
 
 impl App {
     /// In a list: what is past its end is drawn as its end.

@@ -2,29 +2,13 @@
 
 use std::fmt::{Display, Write};
 
+use super::super::event_text::event_text;
 use super::super::model::Model;
-use super::super::views::trace;
-use super::{App, PromptKind};
+use super::line::PromptKind;
+use super::state::{App, Direction, Search};
 
 /// Records that are looked at between two drawings, in some twenty milliseconds.
 const AT_ONCE: u64 = 100_000;
-
-/// Which way to look.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Direction {
-    /// To older records.
-    Back,
-    /// To newer records.
-    Forward,
-}
-
-/// A search under way.
-#[derive(Clone, Copy, Debug)]
-pub struct Search {
-    direction: Direction,
-    /// The place to go on at; going back, the one behind it.
-    at: u64,
-}
 
 impl App {
     /// Looks for the next record that has what was last looked for.
@@ -97,7 +81,7 @@ impl Matcher<'_> {
             return false;
         };
         let Some(frame) = record.frame() else {
-            return self.is_in(&trace::event_text(&record.event), false);
+            return self.is_in(&event_text(&record.event), false);
         };
         self.is_in(frame, true)
             || model.seen.signals.name_of(record).is_some_and(|name| self.is_in(&name, false))

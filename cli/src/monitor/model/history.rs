@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use cantap::TraceRecord;
-use cantap::filter::Filter;
+use cantap_trace::filter::Filter;
 
 /// The past: every record, and a list of those that the filters accept.
 ///

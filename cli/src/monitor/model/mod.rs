@@ -10,10 +10,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use cantap::device::{ClockReport, Counters};
-use cantap::signals::Decoder;
-use cantap::stats::{Options, Statistics, Window};
 use cantap::wire::message::Status;
 use cantap::{Channel, TraceRecord};
+use cantap_analysis::stats::{Options, Statistics, Window};
+use cantap_signals::Decoder;
 
 use super::source::Plan;
 

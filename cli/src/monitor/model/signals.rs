@@ -3,8 +3,8 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use cantap::signals::{Alarm, Decoder, MessageRef, Signal, SignalValue};
 use cantap::{Direction, Frame, TraceEvent, TraceRecord};
+use cantap_signals::{Alarm, Decoder, MessageRef, Signal, SignalValue};
 
 /// Signals with a row; more than any screen shows.
 const MOST_SIGNALS: usize = 1024;

@@ -2,21 +2,21 @@
 
 use std::sync::mpsc::TryRecvError;
 
-use cantap::Device;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
 use super::super::model::SourceState;
 use super::{Plan, Source, Then, lock};
+use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 
 impl Source<'_> {
     /// Puts the bit rates that are found into the plan; what is not found stays as it was. Says what is to be done
     /// after it: an order may have come meanwhile.
     pub(super) fn autobaud(&mut self, plan: &mut Plan) -> Then {
-        let device = match Device::open(&plan.address) {
+        let device = match plan.address.open() {
             Ok(device) => device,
             Err(error) => {
-                self.notice(error.to_string());
+                self.notice(advice::sentence(&error));
                 return Then::GoOn;
             }
         };
@@ -39,7 +39,7 @@ impl Source<'_> {
                 Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
                 Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
                 Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
-                Err(error) => format!("channel {number}: {error}"),
+                Err(error) => format!("channel {number}: {}", advice::told(&error)),
             });
             if !matches!(then, Then::GoOn) {
                 break;

@@ -1,36 +1,34 @@
 //! A device as the source: session after session, whenever it is there.
 
-use std::sync::mpsc::{RecvTimeoutError, TryRecvError};
+use std::sync::mpsc::TryRecvError;
 use std::time::{Duration, Instant};
 
-use cantap::device::{Records, UtcClock};
+use cantap::device::{Happening, Return, UtcClock};
 use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
-use cantap::wire::record::LossStage;
 use cantap::{Channel, Device, Frame, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
 use super::{FIGURES_EVERY, Order, Plan, Source, Then, WAIT, lock};
+use crate::advice;
+use crate::live::{Line, line};
 
-/// How long after it was gone a device is tried again.
-const RETRY_AFTER: Duration = Duration::from_secs(1);
 /// A window is closed so long after its end although nothing came, so that a late frame finds it open.
 const LATENESS_NS: i64 = 1_000_000_000;
 
-/// The board that was at the address, to tell whether it is the same that comes back.
-struct Known {
-    name: String,
-    reconnects: u32,
-    gone_at: Option<Instant>,
-}
-
 impl Source<'_> {
     pub(super) fn run_device(&mut self, mut plan: Plan) {
-        let mut known = None;
+        let mut reconnects = 0;
         loop {
-            let then = self.session(&plan, &mut known).unwrap_or_else(|error| {
-                lock(self.model).source = SourceState::Gone(format!("{error:#}"));
-                self.wait_for_it()
-            });
+            let mut line = open_as(&plan);
+            let then = self.listen(&plan, &mut line, reconnects);
+            reconnects += line.gaps().count;
+            if line.device().is_some() {
+                self.end(&mut line);
+                if !matches!(then, Then::Quit) {
+                    self.note_gap(&plan.channels);
+                }
+            }
+            drop(line);
             match then {
                 Then::GoOn => {}
                 Then::Autobaud => match self.autobaud(&mut plan) {
@@ -40,7 +38,7 @@ impl Source<'_> {
                 },
                 Then::Reopen(other) => {
                     if other.address != plan.address {
-                        known = None;
+                        reconnects = 0;
                         lock(self.model).begin_statistics();
                     }
                     plan = other;
@@ -50,78 +48,91 @@ impl Source<'_> {
         }
     }
 
-    /// The device may come back, and the user may choose another one meanwhile.
-    fn wait_for_it(&mut self) -> Then {
-        let retry_at = Instant::now() + RETRY_AFTER;
+    /// Takes what comes, while the device is there and when it is back, and follows orders, until one ends it.
+    fn listen(&mut self, plan: &Plan, line: &mut Line, reconnects: u32) -> Then {
+        let clock = UtcClock::start();
+        let mut next_figures = Instant::now();
+        let mut pace = None;
         loop {
-            match self.orders.recv_timeout(retry_at.saturating_duration_since(Instant::now())) {
-                Ok(order) => match self.follow(order) {
-                    Then::GoOn => {}
-                    then => return then,
-                },
-                Err(RecvTimeoutError::Timeout) => break,
-                Err(RecvTimeoutError::Disconnected) => return Then::Quit,
+            match line.next(WAIT) {
+                Happening::Records(batch) => self.hand_over(batch, line),
+                Happening::Gone(error) => {
+                    let mut model = lock(self.model);
+                    model.source = SourceState::Gone(advice::sentence(&error));
+                    model.interrupt();
+                }
+                Happening::Back(back) => {
+                    let reconnects = reconnects + line.gaps().count;
+                    pace = None;
+                    if let Some(device) = line.device() {
+                        self.greet(device, plan, &back, reconnects);
+                    }
+                }
+                // Nobody has stopped it.
+                Happening::Ended => return Then::GoOn,
+            }
+            if Instant::now() >= next_figures {
+                next_figures = Instant::now() + FIGURES_EVERY;
+                self.show_figures(line, &clock, &mut pace);
+                self.show_recording();
+            }
+            loop {
+                let followed = match self.orders.try_recv() {
+                    Ok(order) => self.follow_with(line.device(), order),
+                    Err(TryRecvError::Empty) => break,
+                    Err(TryRecvError::Disconnected) => Then::Quit,
+                };
+                if !matches!(followed, Then::GoOn) {
+                    return followed;
+                }
             }
         }
-        self.show_recording();
-        Then::GoOn
     }
 
-    /// One session with the device, until it is gone or an order ends it.
-    fn session(&mut self, plan: &Plan, known: &mut Option<Known>) -> anyhow::Result<Then> {
-        let device = Device::open(&plan.address)?;
-        let mut records = device.records();
-        // No filters, saved ones neither: what is not shown is recorded all the same.
-        let opened = plan.open.open(&device, plan.channels.iter().copied(), plan.mode(), None)?;
-        let clock = UtcClock::start();
-        self.greet(&device, plan, &opened, known);
-        let ended = self.listen(&device, &mut records, &clock);
-        if ended.is_ok() {
-            // If that fails the device has just gone, and the order counts all the same.
-            let _ = device.stop();
+    /// Ends the session; what was captured until then is shown and recorded.
+    fn end(&mut self, line: &mut Line) {
+        // If that fails the device has just gone, and what was ordered counts all the same.
+        let _ = line.stop();
+        loop {
+            match line.next(WAIT) {
+                Happening::Records(batch) => self.hand_over(batch, line),
+                Happening::Gone(_) | Happening::Back(_) => {}
+                Happening::Ended => return,
+            }
         }
-        // What was captured until then is shown and recorded, whatever ended it.
-        while let Ok(Some(batch)) = records.next_batch(WAIT)
-            && !batch.is_empty()
-        {
-            self.hand_over(batch, &records);
+    }
+
+    fn show_figures(&self, line: &Line, clock: &UtcClock, pace: &mut Option<Pace>) {
+        let Some(device) = line.device() else { return };
+        // If it does not answer, the stream says so.
+        let Ok(status) = device.status() else { return };
+        let now_ns = clock.at(Instant::now()).0;
+        let pace = pace.get_or_insert_with(|| Pace::new(now_ns, status.ticks, device.hello().tick_hz));
+        let now_ns = pace.now_ns(now_ns, status.ticks);
+        let mut model = lock(self.model);
+        if let Some(figures) = &mut model.seen.device {
+            figures.status = Some(status);
+            figures.counters = device.counters();
+            figures.clock = Some(device.clock());
         }
-        if !matches!(ended, Ok(Then::Quit)) {
-            self.note_gap(&plan.channels, clock.at(Instant::now()));
-        }
-        if let Some(known) = known {
-            known.gone_at = Some(Instant::now());
-        }
-        ended
+        // What is still on the way must not find its window closed.
+        model.advance(now_ns.saturating_sub(LATENESS_NS));
     }
 
     /// The device is there: says whether it is the one from before, and takes over its bit rates.
-    fn greet(
-        &mut self,
-        device: &Device,
-        plan: &Plan,
-        opened: &[(Channel, ChannelConfig)],
-        known: &mut Option<Known>,
-    ) {
+    fn greet(&self, device: &Device, plan: &Plan, back: &Return, reconnects: u32) {
         let hello = device.hello();
         let name = format!("{} {}", hello.board, hello.serial);
-        let was_gone = matches!(lock(self.model).source, SourceState::Gone(_));
+        let opened = device.open_channels();
         let mut model = lock(self.model);
-        let reconnects = match known {
-            Some(known) if known.name != name => {
-                model.notice =
-                    format!("another board is at {} now: {name} in place of {}", plan.address, known.name);
-                known.reconnects + 1
+        if let Some(other) = &back.other_board {
+            model.notice = format!("another board is at {} now: {other}", plan.address);
+            if !back.only_listening.is_empty() {
+                model.notice.push_str(", and its channels only listen");
             }
-            Some(known) if was_gone => {
-                let seconds = known.gone_at.map_or(0.0, |gone_at| gone_at.elapsed().as_secs_f64());
-                model.notice = format!("{} is back after {seconds:.1} s", plan.address);
-                known.reconnects + 1
-            }
-            Some(known) => known.reconnects,
-            None => 0,
-        };
-        *known = Some(Known { name: name.clone(), reconnects, gone_at: None });
+        } else if let Some(after) = back.after {
+            model.notice = format!("{} is back after {:.1} s", plan.address, after.as_secs_f64());
+        }
         model.seen.device = Some(DeviceFigures {
             queue_bytes: hello.queue_bytes,
             name,
@@ -146,7 +157,7 @@ impl Source<'_> {
         if without_load != model.options().without_load
             || rates.iter().any(|(channel, rate)| model.options().bitrate_of(*channel) != Some(*rate))
         {
-            let options = cantap::stats::Options {
+            let options = cantap_analysis::stats::Options {
                 bitrate_bps: None,
                 channel_bitrate_bps: rates,
                 without_load,
@@ -158,53 +169,14 @@ impl Source<'_> {
         }
     }
 
-    /// Takes what comes and follows orders, until one ends the session.
-    fn listen(&mut self, device: &Device, records: &mut Records, clock: &UtcClock) -> anyhow::Result<Then> {
-        let mut next_figures = Instant::now();
-        let mut pace = None;
-        loop {
-            match records.next_batch(WAIT)? {
-                Some(batch) => self.hand_over(batch, records),
-                None => anyhow::bail!("the device ended its stream; it is opened again"),
-            }
-            if Instant::now() >= next_figures {
-                next_figures = Instant::now() + FIGURES_EVERY;
-                let status = device.status()?;
-                let now_ns = clock.at(Instant::now());
-                let pace =
-                    pace.get_or_insert_with(|| Pace::new(now_ns, status.ticks, device.hello().tick_hz));
-                let now_ns = pace.now_ns(now_ns, status.ticks);
-                let mut model = lock(self.model);
-                if let Some(figures) = &mut model.seen.device {
-                    figures.status = Some(status);
-                    figures.counters = device.counters();
-                    figures.clock = Some(device.clock());
-                }
-                // What is still on the way must not find its window closed.
-                model.advance(now_ns.saturating_sub(LATENESS_NS));
-                drop(model);
-                self.show_recording();
-            }
-            loop {
-                match self.orders.try_recv() {
-                    Ok(order) => match self.follow_with(device, order) {
-                        Then::GoOn => {}
-                        then => return Ok(then),
-                    },
-                    Err(TryRecvError::Empty) => break,
-                    Err(TryRecvError::Disconnected) => return Ok(Then::Quit),
-                }
-            }
-        }
-    }
-
     /// An order, where there is a device to send with.
-    fn follow_with(&mut self, device: &Device, order: Order) -> Then {
+    fn follow_with(&mut self, device: Option<&Device>, order: Order) -> Then {
+        let Some(device) = device else { return self.follow(order) };
         match order {
             Order::Send(channel, frame) => {
                 let frame = TxFrame { tag: 0, frame, at_ticks: None };
                 if let Err(error) = device.send(channel, &[frame]) {
-                    self.notice(error.to_string());
+                    self.notice(advice::told(&error));
                 }
                 Then::GoOn
             }
@@ -212,7 +184,7 @@ impl Source<'_> {
                 let entry = entry.map(|(frame, period)| periodic(device.hello().tick_hz, frame, period));
                 if let Err(error) = device.set_periodic(channel, slot, entry) {
                     let mut model = lock(self.model);
-                    model.notice = error.to_string();
+                    model.notice = advice::told(&error);
                     model.refused.push((channel, slot));
                 }
                 Then::GoOn
@@ -222,22 +194,42 @@ impl Source<'_> {
     }
 
     /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure
-    /// spans it. How many frames are missing nobody knows: at least none.
-    fn note_gap(&mut self, channels: &[Channel], now_ns: i64) {
-        let time_ns = lock(self.model).seen.now_ns.max(now_ns);
-        let event = TraceEvent::Lost { stage: Some(LossStage::Link), count: 0, at_least: true };
-        let gap = channels.iter().map(|channel| TraceRecord { time_ns, channel: channel.number(), event });
-        let gap: Vec<_> = gap.collect();
+    /// spans it.
+    fn note_gap(&mut self, channels: &[Channel]) {
+        let time_ns = UtcClock::start().at(Instant::now()).0;
+        let gap =
+            |channel: &Channel| TraceRecord { time_ns, channel: channel.number(), event: TraceEvent::GAP };
+        let mut gap: Vec<_> = channels.iter().map(gap).collect();
+        self.keep_up(&mut gap);
         self.take(&gap);
         lock(self.model).interrupt();
     }
 
-    fn hand_over(&mut self, batch: Vec<TraceRecord>, records: &Records) {
-        if !batch.is_empty() {
-            self.take(&batch);
-            records.recycle(batch);
+    /// The windows of the time before a gap may be closed already.
+    fn keep_up(&self, records: &mut [TraceRecord]) {
+        let now_ns = lock(self.model).seen.now_ns;
+        for gap in records.iter_mut().filter(|record| record.event == TraceEvent::GAP) {
+            gap.time_ns = gap.time_ns.max(now_ns);
         }
     }
+
+    fn hand_over(&mut self, mut batch: Vec<TraceRecord>, line: &Line) {
+        if !batch.is_empty() {
+            self.keep_up(&mut batch);
+            self.take(&batch);
+            line.recycle(batch);
+        }
+    }
+}
+
+/// A device that is opened as the plan says.
+fn open_as(plan: &Plan) -> Line {
+    let Plan { address, channels, open } = plan.clone();
+    let mode = plan.mode();
+    line(&address, move |device| {
+        // No filters, saved ones neither: what is not shown is recorded all the same.
+        open.open(device, channels.iter().copied(), mode, None).map(|_| ())
+    })
 }
 
 /// How a device's time passes: with the computer's, or, where it does not run in real time (an emulated board), behind it.

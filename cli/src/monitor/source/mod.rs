@@ -13,10 +13,11 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use cantap::wire::message::Mode;
-use cantap::{Address, Channel, Frame, TraceRecord};
+use cantap::{Channel, Frame, TraceRecord};
 
 use super::model::Model;
 use super::recorder::Recorder;
+use crate::address::Address;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
 
@@ -41,7 +42,7 @@ pub struct Plan {
 
 impl Plan {
     /// Only listening to a device, on the channels whose bit rates are known; on both if none is.
-    pub fn listening(address: Address, options: &cantap::stats::Options) -> Self {
+    pub fn listening(address: Address, options: &cantap_analysis::stats::Options) -> Self {
         let mut open = ChannelArgs::default();
         for channel in Channel::ALL.map(Channel::number) {
             let rate = options.bitrate_of(channel);
@@ -74,13 +75,17 @@ impl Plan {
     }
 
     /// The statistics' options with this plan's bit rates, as far as it has any.
-    pub fn options(&self, others: &cantap::stats::Options) -> cantap::stats::Options {
+    pub fn options(&self, others: &cantap_analysis::stats::Options) -> cantap_analysis::stats::Options {
         let rates = self.channels.iter().filter_map(|channel| {
             let number = channel.number();
             let own = ChannelBitrate::of(&self.open.timing.bitrates, number);
             Some((number, own.or_else(|| others.bitrate_of(number))?))
         });
-        cantap::stats::Options { bitrate_bps: None, channel_bitrate_bps: rates.collect(), ..others.clone() }
+        cantap_analysis::stats::Options {
+            bitrate_bps: None,
+            channel_bitrate_bps: rates.collect(),
+            ..others.clone()
+        }
     }
 }
 

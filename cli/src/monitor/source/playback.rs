@@ -7,11 +7,12 @@ use std::sync::mpsc::RecvTimeoutError;
 use std::time::{Duration, Instant};
 
 use cantap::TraceRecord;
-use cantap::formats::{OpenError, ReadOptions, TraceReader, open_reader};
-use cantap::playback::{Due, Playback};
+use cantap_formats::{OpenError, ReadOptions, TraceReader, open_reader};
+use cantap_trace::playback::{Due, Playback};
 
 use super::super::model::SourceState;
 use super::{FIGURES_EVERY, Order, Source, Then, WAIT, lock};
+use crate::advice;
 
 /// Records handed over under one lock.
 const MOST_AT_ONCE: usize = 4096;
@@ -57,7 +58,7 @@ impl Source<'_> {
         let mut playback = match Playback::new(|| Readable::open(path, &unread), start.elapsed()) {
             Ok(playback) => playback,
             Err(error) => {
-                lock(self.model).source = SourceState::Gone(error.to_string());
+                lock(self.model).source = SourceState::Gone(advice::told(&error));
                 return self.wait_without_source();
             }
         };

@@ -2,9 +2,9 @@
 
 use std::sync::Arc;
 
-use cantap::signals::{Decoder, Source};
-use cantap::stats::Options;
 use cantap::{TraceEvent, TraceRecord};
+use cantap_analysis::stats::Options;
+use cantap_signals::{Decoder, Source};
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 
@@ -86,7 +86,7 @@ fn alarms_are_red_above_and_blue_below_each_with_its_arrow() {
     let folder = tempfile::tempdir().unwrap();
     let path = folder.path().join("m.toml");
     std::fs::write(&path, text).unwrap();
-    let database = cantap::signals::load(&path).unwrap();
+    let database = cantap_signals::load(&path).unwrap();
     assert_eq!(database.warnings, []);
     let decoder = Arc::new(Decoder::new(vec![Source { channel: None, database }]));
     for (data, arrow, colour) in [("FF", "▲", Color::LightRed), ("01", "▼", Color::LightBlue)] {

@@ -1,9 +1,9 @@
 //! What keys do.
 
-use cantap::signals::Decoder;
-use cantap::stats::Options;
 use cantap::wire::message::Mode;
 use cantap::{Channel, TraceRecord};
+use cantap_analysis::stats::Options;
+use cantap_signals::Decoder;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::super::app::{Flow, TimeMode, View};

@@ -11,13 +11,13 @@ use std::path::{Path, PathBuf};
 use std::sync::mpsc::Receiver;
 
 use cantap::device::ClockReport;
-use cantap::formats::{ReadOptions, open_reader};
-use cantap::signals::{Decoder, Source};
-use cantap::stats::Options;
 use cantap::wire::BitTiming;
 use cantap::wire::message::{ChannelConfig, ChannelStatus, Status};
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage};
-use cantap::{Address, Direction, TraceEvent, TraceRecord};
+use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap_analysis::stats::Options;
+use cantap_formats::{ReadOptions, open_reader};
+use cantap_signals::{Decoder, Source};
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::app::{App, Flow, View};
@@ -25,6 +25,8 @@ use super::model::{DeviceFigures, Model, Recording, SourceState};
 use super::source::{Order, Plan};
 use super::theme::Theme;
 use super::{orders, screen, text};
+
+use crate::address::Address;
 
 /// A small screen and a wide one.
 const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];
@@ -35,7 +37,7 @@ fn here() -> PathBuf {
 
 /// Two minutes of a boat's bus, with an error, a loss, and frames of a second channel in between.
 fn model() -> Model {
-    let database = cantap::signals::load(&here().join("nmea2000.toml")).unwrap();
+    let database = cantap_signals::load(&here().join("nmea2000.toml")).unwrap();
     assert_eq!(database.warnings, []);
     let decoder = Decoder::new(vec![Source { channel: None, database }]);
     let options = Options { bitrate_bps: Some(250_000), ..Options::default() };
@@ -43,7 +45,7 @@ fn model() -> Model {
     model.seen.signals.choose("Speed");
     model.seen.signals.choose("Course");
     model.seen.signals.choose("Moving");
-    let log = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/tests/data/nmea2000.log.gz");
+    let log = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/formats/tests/data/nmea2000.log.gz");
     let records = open_reader(log, &ReadOptions::default()).unwrap();
     let mut records: Vec<_> = records.take(6000).map(Result::unwrap).collect();
     let before = records[5993].time_ns;
@@ -69,7 +71,11 @@ fn device() -> DeviceFigures {
         queue_bytes: 98_304,
         name: "olimex-p405 3A0042001951".to_owned(),
         reconnects: 1,
-        clock: Some(ClockReport { drift_ppm: Some(-12.34), round_trip_ns: 412_000 }),
+        clock: Some(ClockReport {
+            drift_ppm: Some(-12.34),
+            round_trip_ns: 412_000,
+            ..ClockReport::default()
+        }),
         ..DeviceFigures::default()
     };
     let closed = ChannelStatus {
@@ -109,7 +115,7 @@ fn app(view: View) -> (App, Receiver<Order>) {
     let (sender, receiver) = orders();
     let theme = Theme { colour: true, light: false, unicode: true };
     let options = Options { channel_bitrate_bps: vec![(1, 250_000)], ..Options::default() };
-    let plan = Plan::listening(Address::Virtual(String::new()), &options);
+    let plan = Plan::listening(Address::of_virtual_device(), &options);
     (App::new(view, theme, Some(plan), sender), receiver)
 }
 

@@ -5,41 +5,10 @@ use ratatui::layout::Rect;
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 
-use super::super::app::App;
+use super::super::app::{App, Column};
+use super::super::event_text::printable;
 use super::super::model::{Model, Row, Seen};
-use super::trace::printable;
-
-/// A column to sort by.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
-#[serde(rename_all = "lowercase")]
-pub enum Column {
-    /// Identifier.
-    Id,
-    /// Frames so far, most first.
-    Count,
-    /// Period, shortest first.
-    Period,
-    /// Jitter, largest first.
-    Jitter,
-    /// Last frame, newest first.
-    Time,
-    /// Name.
-    Name,
-}
-
-impl Column {
-    /// The next one.
-    pub const fn next(self) -> Self {
-        match self {
-            Self::Id => Self::Count,
-            Self::Count => Self::Period,
-            Self::Period => Self::Jitter,
-            Self::Jitter => Self::Time,
-            Self::Time => Self::Name,
-            Self::Name => Self::Id,
-        }
-    }
-}
+use super::list::list;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
@@ -73,7 +42,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         if ascii { "ASCII    " } else { "" },
         mark(Column::Name, "Name"),
     ));
-    super::list(frame, area, app, heading, rows.len(), |index, app| line(rows[index], ascii, app, seen));
+    list(frame, area, app, heading, rows.len(), |index, app| line(rows[index], ascii, app, seen));
 }
 
 fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {

@@ -4,6 +4,7 @@ mod bottom;
 pub mod fixed;
 pub mod graph;
 pub mod help;
+mod list;
 pub mod record;
 pub mod send;
 pub mod signals;
@@ -13,7 +14,7 @@ pub mod trace;
 
 use ratatui::Frame;
 use ratatui::buffer::Buffer;
-use ratatui::layout::{Constraint, Layout, Rect};
+use ratatui::layout::{Constraint, Layout};
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
@@ -21,6 +22,8 @@ use ratatui::widgets::Paragraph;
 use super::app::{App, View};
 use super::model::Model;
 use super::theme::Theme;
+
+pub use list::first_row;
 
 /// The smallest screen that anything fits on.
 pub const LEAST: (u16, u16) = (40, 8);
@@ -103,40 +106,4 @@ pub fn tab_at(column: u16) -> Option<View> {
         end += view.title().len() as u16 + 3;
         column < end
     })
-}
-
-/// A number of bytes for people.
-pub fn bytes(bytes: u64) -> String {
-    match bytes {
-        0..10_000 => format!("{bytes} B"),
-        10_000..10_000_000 => format!("{} kB", bytes / 1000),
-        10_000_000..10_000_000_000 => format!("{} MB", bytes / 1_000_000),
-        _ => format!("{} GB", bytes / 1_000_000_000),
-    }
-}
-
-/// The first row to show so that the selected one is on the page.
-pub fn first_row(selected: usize, rows: usize) -> usize {
-    selected.saturating_sub(rows.saturating_sub(1))
-}
-
-/// Lines below a heading, from the first row that keeps the selected one in sight.
-fn list(
-    frame: &mut Frame<'_>,
-    area: Rect,
-    app: &mut App,
-    heading: Line<'static>,
-    count: usize,
-    row: impl Fn(usize, &App) -> Line<'static>,
-) {
-    let rows = usize::from(area.height).saturating_sub(1);
-    app.page_rows = rows;
-    app.selected = app.selected.min(count.saturating_sub(1));
-    let first = first_row(app.selected, rows);
-    let mut lines = vec![heading.style(Theme::heading())];
-    for index in first..count.min(first + rows) {
-        let line = row(index, app);
-        lines.push(if index == app.selected { line.style(Theme::bar()) } else { line });
-    }
-    frame.render_widget(Paragraph::new(lines), area);
 }

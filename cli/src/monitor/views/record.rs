@@ -7,6 +7,7 @@ use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::Model;
+use super::list::bytes;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
@@ -26,7 +27,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             vec![
                 Line::from(format!("Recording to {}", recording.path)).style(app.theme.error()),
                 Line::from(format!("Records   {}", recording.records)),
-                Line::from(format!("Size      {}", super::bytes(recording.bytes))),
+                Line::from(format!("Size      {}", bytes(recording.bytes))),
                 Line::from(format!("Time      {seconds:.1} s")),
                 Line::from("r stops."),
             ]

@@ -7,6 +7,7 @@ use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::Seen;
+use super::list::list;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
@@ -44,5 +45,5 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             )
         })
         .collect();
-    super::list(frame, body, app, heading, lines.len(), |index, _| Line::from(lines[index].clone()));
+    list(frame, body, app, heading, lines.len(), |index, _| Line::from(lines[index].clone()));
 }

@@ -1,6 +1,6 @@
 //! Live values of decoded signals, with extremes, alarms and the recent past.
 
-use cantap::signals::Alarm;
+use cantap_signals::Alarm;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -9,6 +9,7 @@ use ratatui::widgets::{Paragraph, Wrap};
 
 use super::super::app::App;
 use super::super::model::{Model, Seen, SignalRow};
+use super::list::list;
 
 /// Columns of the small curve.
 const SPARK_COLUMNS: usize = 16;
@@ -36,7 +37,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         "  C {:<name_columns$} {:>22} {:>10} {:>10} Last 8 s",
         "Signal", "Value", "Min", "Max"
     ));
-    super::list(frame, area, app, heading, app.signal_order.len(), |index, app| {
+    list(frame, area, app, heading, app.signal_order.len(), |index, app| {
         line(&rows[app.signal_order[index]], name_columns, app, seen)
     });
 }

@@ -6,7 +6,7 @@ use ratatui::text::{Line, Span};
 use super::super::app::App;
 use super::super::model::{Model, SourceState};
 use super::super::theme::Theme;
-use super::bytes;
+use super::list::bytes;
 
 /// Characters of an address that there is room for beside the rest.
 const MOST_ADDRESS: usize = 32;

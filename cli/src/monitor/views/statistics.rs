@@ -1,7 +1,8 @@
 //! Load with its history, rates, errors, losses per stage, and how the device is.
 
-use cantap::stats::ChannelStatistics;
+use cantap::device::ClockSource;
 use cantap::wire::record::{BusErrorKind, LossStage};
+use cantap_analysis::stats::ChannelStatistics;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::text::{Line, Span};
@@ -10,6 +11,7 @@ use ratatui::widgets::Paragraph;
 use super::super::app::App;
 use super::super::model::{DeviceFigures, Model, Seen};
 use super::super::theme::Theme;
+use super::list::bytes;
 use crate::words::{error_name, state_name};
 
 /// Columns of the gauge on a narrow and on a wide screen.
@@ -46,8 +48,8 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         "Memory    {} of {} records, {} of {}",
         model.history.len(),
         seen.taken,
-        super::bytes(used as u64),
-        super::bytes(most as u64)
+        bytes(used as u64),
+        bytes(most as u64)
     )));
     app.page_rows = usize::from(area.height);
     // Scrolled with the arrows where the screen is small.
@@ -141,8 +143,8 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
         Span::styled(bar, app.theme.load(load)),
         Span::raw(format!(
             " {bound}{load:.1} %  instant {}  mean {}  peak {}",
-            percent(work.and_then(cantap::stats::WorkLoad::instant_pct)),
-            percent(work.and_then(cantap::stats::WorkLoad::mean_pct)),
+            percent(work.and_then(cantap_analysis::stats::WorkLoad::instant_pct)),
+            percent(work.and_then(cantap_analysis::stats::WorkLoad::mean_pct)),
             percent(peak)
         )),
     ])
@@ -181,8 +183,9 @@ fn device_lines(device: &DeviceFigures, lines: &mut Vec<Line<'static>>) {
     if let Some(clock) = &device.clock {
         let drift = clock.drift_ppm.map_or("not known yet".to_owned(), |ppm| format!("{ppm:+.2} ppm"));
         lines.push(Line::from(format!(
-            "Clock     drift {drift}, round trip {} µs",
-            clock.round_trip_ns / 1000
+            "Clock     drift {drift}, round trip {} µs{}",
+            clock.round_trip_ns / 1000,
+            if clock.source == ClockSource::Frames { ", by USB frames" } else { "" }
         )));
     }
 }

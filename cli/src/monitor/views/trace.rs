@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use cantap::wire::record::{ErrorState, LossStage};
+use cantap::wire::record::ErrorState;
 use cantap::{TraceEvent, TraceRecord};
 use ratatui::Frame;
 use ratatui::layout::Rect;
@@ -11,9 +11,10 @@ use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
 
 use super::super::app::{App, TimeMode};
+use super::super::event_text::{event_text, hex, lost, printable};
 use super::super::model::Model;
 use super::super::theme::Theme;
-use crate::words::{error_name, failure_name, state_name};
+use super::list::bytes;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
@@ -44,7 +45,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let width = usize::from(area.width);
     let columns =
         format!("{:>17} C   {:>8} T L {:<23} {:<8} Name", time_heading(app.time_mode), "ID", "Data", "ASCII");
-    let memory = format!("{} of {}", super::bytes(used as u64), super::bytes(most as u64));
+    let memory = format!("{} of {}", bytes(used as u64), bytes(most as u64));
     let room = width.saturating_sub(columns.chars().count() + memory.chars().count());
     let heading = if room > 1 { format!("{columns}{:room$}{memory}", "") } else { columns };
     let mut lines = vec![Line::styled(heading, Theme::heading())];
@@ -111,67 +112,12 @@ fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &M
     }
 }
 
-/// Bytes as pairs of digits.
-pub fn hex(data: &[u8]) -> String {
-    let mut text = String::with_capacity(24);
-    for (index, byte) in data.iter().enumerate() {
-        // Writing to a String cannot fail.
-        let _ = write!(text, "{}{byte:02X}", if index == 0 { "" } else { " " });
-    }
-    text
-}
-
-/// Bytes as characters, dots for those without one.
-pub fn printable(data: &[u8]) -> String {
-    data.iter().map(|byte| if (0x20..0x7F).contains(byte) { *byte as char } else { '.' }).collect()
-}
-
-/// What a record says that is no frame.
-pub fn event_text(event: &TraceEvent) -> String {
-    let counters = |counters: Option<(u8, u8)>| {
-        counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
-    };
-    match *event {
-        TraceEvent::Frame { .. } => String::new(),
-        TraceEvent::BusError { kind, counters: at } => {
-            format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at))
-        }
-        TraceEvent::ErrorsSuppressed { count } => format!("E {count} more bus errors"),
-        TraceEvent::State { state, counters: at } => format!("S {}{}", state_name(state), counters(at)),
-        TraceEvent::Lost { stage, count, at_least } => {
-            format!("L {} frames lost {}", lost(count, at_least), stage.map_or("somewhere", stage_name))
-        }
-        TraceEvent::TransmitFailed { tag, reason } => {
-            format!("F frame {tag} not sent: {}", failure_name(reason))
-        }
-    }
-}
-
-/// How that is drawn.
+/// How what is no frame is drawn.
 fn event_style(event: &TraceEvent, theme: Theme) -> Style {
     match event {
         TraceEvent::Lost { .. } => theme.loss(),
         TraceEvent::State { state: ErrorState::Active, .. } => theme.label(),
         _ => theme.error(),
-    }
-}
-
-/// How many frames are missing.
-fn lost(count: u32, at_least: bool) -> String {
-    match (count, at_least) {
-        // As while a device was gone.
-        (0, true) => "an unknown number of".to_owned(),
-        (count, true) => format!("at least {count}"),
-        (count, false) => count.to_string(),
-    }
-}
-
-fn stage_name(stage: LossStage) -> &'static str {
-    match stage {
-        LossStage::Controller => "in the controller",
-        LossStage::Queue => "in the device's queue",
-        LossStage::Link => "on the way to the host",
-        LossStage::Host => "in the host",
     }
 }
 

@@ -171,6 +171,11 @@ impl Controller {
         self.dominant_bits += dominant_bits;
     }
 
+    /// The bus is held dominant: what was under way does not end.
+    pub(crate) fn bus_stuck(&mut self) {
+        self.receiving |= self.listens();
+    }
+
     /// The frame or error frame is over.
     pub(crate) fn bus_free(&mut self) {
         self.receiving = false;

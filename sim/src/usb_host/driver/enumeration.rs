@@ -1,12 +1,13 @@
 //! The control transfers: which there are, and which follows which.
 
-use super::super::control::{Outcome, Request, Transfer};
+use super::super::control::{
+    CLEAR_FEATURE, ENDPOINT_HALT, Outcome, Request, SET_CONFIGURATION, SET_INTERFACE, Transfer,
+};
 use super::super::{EnumerationError, descriptors};
 use super::{Driver, Identity, LineCoding, Pending};
 
 const GET_DESCRIPTOR: u8 = 6;
 const SET_ADDRESS: u8 = 5;
-const SET_CONFIGURATION: u8 = 9;
 const SET_LINE_CODING: u8 = 0x20;
 const GET_LINE_CODING: u8 = 0x21;
 const SET_CONTROL_LINE_STATE: u8 = 0x22;
@@ -35,6 +36,8 @@ pub(super) enum Purpose {
     PutCoding,
     GetCoding,
     Lines,
+    /// The driver found a bulk pipe halted; its address.
+    ClearHalt(u8),
     User,
 }
 
@@ -52,6 +55,7 @@ impl Purpose {
             Self::PutCoding => "SET_LINE_CODING",
             Self::GetCoding => "GET_LINE_CODING",
             Self::Lines => "SET_CONTROL_LINE_STATE",
+            Self::ClearHalt(_) => "CLEAR_FEATURE(ENDPOINT_HALT)",
             Self::User => "a test's request",
         }
     }
@@ -94,18 +98,23 @@ impl Driver {
                 let lines = if self.port_wanted { 3 } else { 0 };
                 Request::new(CLASS_OUT, SET_CONTROL_LINE_STATE, lines, interface, 0)
             }
+            Purpose::ClearHalt(address) => Request::clear_halt(address),
             Purpose::User => match self.user.pop_front() {
                 Some(request) => request,
                 None => return,
             },
         };
-        self.pending = Some(Pending { purpose, transfer: Transfer::new(request), started: None });
+        self.pending =
+            Some(Pending { purpose, transfer: Transfer::new(request.clone()), request, started: None });
     }
 
     pub(super) fn ended(&mut self, outcome: Outcome) {
-        let Some(Pending { purpose, .. }) = self.pending.take() else {
+        let Some(Pending { purpose, request, .. }) = self.pending.take() else {
             return;
         };
+        if matches!(outcome, Outcome::Done(_)) {
+            self.follow(&request);
+        }
         if purpose == Purpose::User {
             self.outcomes.push_back(outcome);
             return;
@@ -188,7 +197,7 @@ impl Driver {
                 self.coding_set = true;
             }
             Purpose::Lines => self.port_open = self.lines_sent,
-            Purpose::User => {}
+            Purpose::ClearHalt(_) | Purpose::User => {}
         }
         Ok(())
     }
@@ -200,10 +209,40 @@ impl Driver {
         self.begin(next.map_or(Purpose::Configure, Purpose::Text));
     }
 
+    /// What a request that was carried out means for the host's side of the pipes: where the device begins with DATA0, so does the
+    /// host (USB 2.0, 9.1.1.5 and 9.4.5), and a configuration takes the port from whoever had it open.
+    fn follow(&mut self, request: &Request) {
+        let Some(acm) = self.acm else { return };
+        match (request.kind, request.request) {
+            (TO_DEVICE, SET_CONFIGURATION) => {
+                (self.in_data1, self.out_data1, self.notify_data1) = (false, false, false);
+                self.bound = request.value != 0;
+                self.port_open = false;
+                self.stalled = None;
+                self.partial.clear();
+                self.output.clear();
+            }
+            (0x01, SET_INTERFACE) if request.index == u16::from(acm.data_interface) => {
+                (self.in_data1, self.out_data1) = (false, false);
+            }
+            (0x01, SET_INTERFACE) => self.notify_data1 = false,
+            (0x02, CLEAR_FEATURE) if request.value == ENDPOINT_HALT => {
+                let address = request.index as u8;
+                if address == acm.input.number | 0x80 {
+                    self.in_data1 = false;
+                } else if address == acm.output.number {
+                    self.out_data1 = false;
+                } else {
+                    self.notify_data1 = false;
+                }
+            }
+            _ => {}
+        }
+    }
+
     fn configured(&mut self) {
         self.configured = true;
         self.enumerations += 1;
-        (self.in_data1, self.out_data1, self.notify_data1) = (false, false, false);
         if let (Some(device), Some(acm)) = (self.device, self.acm) {
             self.identity = Some(Identity { device, acm, strings: self.strings.clone() });
         }

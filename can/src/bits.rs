@@ -1,0 +1,273 @@
+//! Exact length of a classical CAN frame on the bus: every bit from the start of frame to the end of
+//! the intermission, stuff bits included (ISO 11898-1:2015, 10.4 and 10.5).
+//!
+//! The bus load, the tightening of stamps and the bus simulator call this once per frame, so the CRC
+//! comes from one table per byte position and stuff bits are found with whole-word operations.
+
+use crate::Frame;
+
+/// The generator polynomial of classical CAN's CRC-15, without its leading term.
+const CRC15_POLYNOMIAL: u16 = 0x4599;
+/// Bits of the CRC sequence.
+const CRC_BITS: u32 = 15;
+/// CRC delimiter, ACK slot, ACK delimiter, seven bits end of frame: never stuffed.
+const TAIL_BITS: u32 = 1 + 1 + 1 + 7;
+/// Bits of the intermission, which keeps two frames apart.
+pub const INTERMISSION_BITS: u32 = 3;
+/// Start of frame, 11 identifier bits, RTR, IDE, r0, four bits DLC.
+const STANDARD_HEADER_BITS: u32 = 1 + 11 + 1 + 1 + 1 + 4;
+/// Start of frame, 11 identifier bits, SRR, IDE, 18 identifier bits, RTR, r1, r0, four bits DLC.
+const EXTENDED_HEADER_BITS: u32 = 1 + 11 + 1 + 1 + 18 + 1 + 1 + 1 + 4;
+/// SRR and IDE of an extended frame, both recessive.
+const SRR_AND_IDE: u64 = 0b11;
+/// Bytes that the CRC covers at most: 39 header bits fill five bytes, then the data.
+const MAX_CRC_BYTES: usize = 5 + 8;
+
+/// `CRC_OF[k][b]` is the CRC of byte `b` followed by `k` zero bytes. The CRC is linear and starts at
+/// zero, so a frame's CRC is the exclusive or of one entry per byte, and zeros in front cost nothing.
+static CRC_OF: [[u16; 256]; MAX_CRC_BYTES] = crc_tables();
+
+const fn crc_tables() -> [[u16; 256]; MAX_CRC_BYTES] {
+    let mut tables = [[0; 256]; MAX_CRC_BYTES];
+    let mut byte = 0;
+    while byte < 256 {
+        let mut crc = 0;
+        let mut position = 0;
+        while position < MAX_CRC_BYTES {
+            let next = if position == 0 { byte as u16 } else { 0 };
+            crc = crc_byte(crc, next);
+            tables[position][byte] = crc;
+            position += 1;
+        }
+        byte += 1;
+    }
+    tables
+}
+
+const fn crc_byte(mut crc: u16, byte: u16) -> u16 {
+    let mut bit = 8;
+    while bit > 0 {
+        bit -= 1;
+        let feedback = (crc >> (CRC_BITS - 1)) ^ (byte >> bit & 1);
+        crc = crc << 1 & 0x7FFF;
+        if feedback & 1 != 0 {
+            crc ^= CRC15_POLYNOMIAL;
+        }
+    }
+    crc
+}
+
+/// What a frame is made of on the bus.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct FrameBits {
+    /// Bits without stuff bits, with the intermission's three.
+    pub unstuffed: u32,
+    /// Stuff bits, all between start of frame and the end of the CRC.
+    pub stuff: u32,
+    /// The CRC-15 sequence.
+    pub crc: u16,
+}
+
+impl FrameBits {
+    /// Works out `frame`.
+    #[inline]
+    pub fn of(frame: &Frame) -> Self {
+        let id = frame.id();
+        let raw = u64::from(id.raw());
+        let remote = u64::from(frame.is_remote());
+        let dlc = u64::from(frame.dlc());
+        // Dominant is 0: start of frame and the reserved bits add nothing.
+        let (header, header_bits) = if id.is_extended() {
+            let (base, extension) = (raw >> 18, raw & 0x3_FFFF);
+            (base << 27 | SRR_AND_IDE << 25 | extension << 7 | remote << 6 | dlc, EXTENDED_HEADER_BITS)
+        } else {
+            (raw << 7 | remote << 6 | dlc, STANDARD_HEADER_BITS)
+        };
+        let data_bits = 8 * frame.data_len() as u32;
+        let data = u128::from(u64::from_be_bytes(frame.padded_data())) >> (64 - data_bits);
+        let message = u128::from(header) << data_bits | data;
+        let message_bits = header_bits + data_bits;
+        let crc = CRC_OF
+            .iter()
+            .zip(message.to_le_bytes())
+            .take(message_bits.div_ceil(8) as usize)
+            .fold(0, |crc, (table, byte)| crc ^ table[usize::from(byte)]);
+        // Everything that is stuffed, first bit on top.
+        let stuffed_bits = message_bits + CRC_BITS;
+        let sequence = (message << CRC_BITS | u128::from(crc)) << (128 - stuffed_bits);
+        Self {
+            unstuffed: stuffed_bits + TAIL_BITS + INTERMISSION_BITS,
+            stuff: count_stuff_bits(sequence, stuffed_bits),
+            crc,
+        }
+    }
+
+    /// All bits, from start of frame to the end of the intermission.
+    pub const fn total(&self) -> u32 {
+        self.unstuffed + self.stuff
+    }
+
+    /// How long all bits take at `bitrate_bps`, in nanoseconds, rounded down.
+    pub const fn duration_ns(&self, bitrate_bps: u32) -> u64 {
+        // A bit rate of zero is refused wherever one is entered; here it would mean a division by zero.
+        let bitrate_bps = if bitrate_bps == 0 { 1 } else { bitrate_bps };
+        self.total() as u64 * 1_000_000_000 / bitrate_bps as u64
+    }
+}
+
+/// Bits that `frame` takes on the bus, with stuff bits and intermission.
+#[inline]
+pub fn bits_on_bus(frame: &Frame) -> u32 {
+    FrameBits::of(frame).total()
+}
+
+/// Counts stuff bits of the top `len` bits of `sequence` (at most 118).
+///
+/// After five equal bits the opposite one is inserted, and that one counts for the next five. So a run of
+/// five to nine equal bits has one stuff bit, and nearly all runs are like that; only a longer run, or one of exactly
+/// five with exactly four of the opposite behind it, needs a closer look.
+#[inline]
+fn count_stuff_bits(sequence: u128, len: u32) -> u32 {
+    // Bit i of each mask, counted from the top, speaks of bit i of the sequence.
+    let same_as_before = !(sequence ^ sequence >> 1) & !TOP_BIT;
+    let valid = !(u128::MAX >> len);
+    let four_equal = same_as_before & same_as_before >> 1 & same_as_before >> 2;
+    let five_equal = four_equal & same_as_before >> 3 & valid;
+    let four_equal_after_a_change = four_equal & !(same_as_before >> 3) & valid;
+
+    let ends = five_equal & !(five_equal >> 1);
+    let two_fives = five_equal & five_equal >> 5;
+    if two_fives | ends >> 4 & four_equal_after_a_change == 0 {
+        return ends.count_ones();
+    }
+    count_one_by_one(five_equal, four_equal_after_a_change)
+}
+
+/// The first bit of a sequence.
+const TOP_BIT: u128 = 1 << 127;
+
+/// The next stuff bit is four bits on if they all repeat the last one, else where five equal bits end that begin
+/// later.
+fn count_one_by_one(five_equal: u128, four_equal_after_a_change: u128) -> u32 {
+    let mut count = 0;
+    let mut ahead = five_equal;
+    while ahead != 0 {
+        let mut place = ahead.leading_zeros();
+        count += 1;
+        while four_equal_after_a_change << (place + 4) & TOP_BIT != 0 {
+            place += 4;
+            count += 1;
+        }
+        ahead = five_equal & u128::MAX >> (place + 5);
+    }
+    count
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn frame(text: &str) -> Frame {
+        text.parse().unwrap()
+    }
+
+    /// The same by the book, one bit at a time.
+    fn bit_by_bit(frame: &Frame) -> FrameBits {
+        let mut bits = Vec::new();
+        let mut put = |value: u32, width: u32| bits.extend((0..width).rev().map(|bit| value >> bit & 1));
+        let (raw, remote) = (frame.id().raw(), u32::from(frame.is_remote()));
+        put(0, 1);
+        if frame.id().is_extended() {
+            put(raw >> 18, 11);
+            put(0b11, 2);
+            put(raw, 18);
+            put(remote, 1);
+            put(0, 2);
+        } else {
+            put(raw, 11);
+            put(remote, 1);
+            put(0, 2);
+        }
+        put(u32::from(frame.dlc()), 4);
+        frame.data().iter().for_each(|byte| put(u32::from(*byte), 8));
+        let mut crc: u16 = 0;
+        for bit in &bits {
+            let feedback = *bit as u16 ^ crc >> 14 & 1;
+            crc = (crc << 1 & 0x7FFF) ^ (feedback * 0x4599);
+        }
+        bits.extend((0..15).rev().map(|bit| u32::from(crc >> bit & 1)));
+        let unstuffed = bits.len() as u32 + 1 + 2 + 7 + 3;
+        let (mut stuff, mut run, mut last) = (0, 0, 2);
+        for bit in bits {
+            run = if bit == last { run + 1 } else { 1 };
+            last = bit;
+            if run == 5 {
+                stuff += 1;
+                last = 1 - bit;
+                run = 1;
+            }
+        }
+        FrameBits { unstuffed, stuff, crc }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(20_000))]
+        #[test]
+        fn any_frame_agrees_with_the_bit_by_bit_model(
+            extended: bool, raw: u32, remote: bool, dlc in 0..16u8, data: [u8; 8], sparse: bool,
+        ) {
+            // Sparse data and identifiers make many stuff bits.
+            let (raw, data) = if sparse { (raw & raw >> 3 & raw << 2, data.map(|byte| byte & 0x81)) } else { (raw, data) };
+            let id = if extended { crate::Id::extended_truncated(raw) } else { crate::Id::standard_truncated(raw) };
+            let frame = Frame::from_bus(id, remote, dlc, data);
+            prop_assert_eq!(FrameBits::of(&frame), bit_by_bit(&frame));
+        }
+    }
+
+    #[test]
+    fn the_earlier_analysers_first_example_agrees() {
+        let bits = FrameBits::of(&frame("000#55"));
+        assert_eq!(bits, FrameBits { unstuffed: 55, stuff: 3, crc: 0x722 });
+        assert_eq!(bits.duration_ns(1_000_000), 58_000);
+    }
+
+    #[test]
+    fn the_two_node_traffic_agrees_bit_for_bit() {
+        for (text, total) in [
+            ("001#8001880189018C02", 119),
+            ("001#88098A0088008101", 119),
+            ("001#88008C810C800980", 120),
+            ("001#0880018001890181", 121),
+            ("001#0C820C881888018B", 119),
+            ("001#8080008001800288", 121),
+        ] {
+            assert_eq!(bits_on_bus(&frame(text)), total, "{text}");
+        }
+    }
+
+    #[test]
+    fn no_frame_is_shorter_or_longer_than_the_bus_limits() {
+        let all_ids = |remote, dlc| {
+            (0..=0x7FF).map(move |raw| {
+                let id = crate::Id::standard_truncated(raw);
+                bits_on_bus(&Frame::from_bus(id, remote, dlc, [0; 8]))
+            })
+        };
+        assert_eq!(all_ids(false, 0).min(), Some(48));
+        assert_eq!((0..16).flat_map(|dlc| all_ids(true, dlc)).min(), Some(47));
+        assert_eq!(bits_on_bus(&frame("555#")), 48);
+        assert_eq!(FrameBits::of(&frame("00000000#0000000000000000")).unstuffed, 131);
+        assert_eq!(FrameBits::of(&frame("000#0000000000000000")).unstuffed, 111);
+    }
+
+    #[test]
+    fn a_dlc_above_eight_and_a_remote_frame_carry_what_the_bus_carries() {
+        let nine = FrameBits::of(&frame("123#1122334455667788_9"));
+        let eight = FrameBits::of(&frame("123#1122334455667788"));
+        assert_eq!((nine.unstuffed, eight.unstuffed), (111, 111));
+        assert_ne!(nine.crc, eight.crc);
+        assert_eq!(FrameBits::of(&frame("123#R8")).unstuffed, 47);
+        assert_eq!(FrameBits::of(&frame("00000123#R8_F")).unstuffed, 67);
+    }
+}

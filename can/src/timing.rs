@@ -1,0 +1,197 @@
+//! Bit timing: what a controller is told, and every way to reach a bit rate.
+//!
+//! Ranges are bxCAN's (RM0090, "CAN bit timing register"): prescaler 1 to 1024, bit segment 1
+//! (propagation and phase segment 1) 1 to 16, bit segment 2 1 to 8, jump width 1 to 4 quanta. A bit
+//! is one synchronisation quantum and both segments long.
+
+/// Slowest bit rate that is offered, in bit/s.
+pub const MIN_BITRATE_BPS: u32 = 5_000;
+/// Fastest bit rate of classical CAN, in bit/s.
+pub const MAX_BITRATE_BPS: u32 = 1_000_000;
+
+/// One configuration of a bit.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[cfg_attr(feature = "serde", derive(serde::Serialize, serde::Deserialize))]
+pub struct BitTiming {
+    /// Controller clocks per time quantum: 1 to 1024.
+    pub prescaler: u16,
+    /// Quanta of propagation segment and phase segment 1: 1 to 16.
+    pub segment1: u8,
+    /// Quanta of phase segment 2: 1 to 8.
+    pub segment2: u8,
+    /// Resynchronisation jump width in quanta: 1 to 4, at most `segment2`.
+    pub jump_width: u8,
+}
+
+/// Why there is no timing for a bit rate.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum NoTiming {
+    /// Outside [`MIN_BITRATE_BPS`] to [`MAX_BITRATE_BPS`].
+    OutOfRange,
+    /// This clock cannot be divided to that bit rate; the nearest rates below and above, in bit/s,
+    /// rounded.
+    Unreachable {
+        /// Nearest below.
+        below_bps: Option<u32>,
+        /// Nearest above.
+        above_bps: Option<u32>,
+    },
+}
+
+impl BitTiming {
+    /// Whether every field is in the controller's range.
+    pub const fn is_valid(&self) -> bool {
+        matches!(self.prescaler, 1..=1024)
+            && matches!(self.segment1, 1..=16)
+            && matches!(self.segment2, 1..=8)
+            && matches!(self.jump_width, 1..=4)
+            && self.jump_width <= self.segment2
+    }
+
+    /// Quanta per bit: 3 to 25.
+    pub const fn quanta(&self) -> u32 {
+        1 + self.segment1 as u32 + self.segment2 as u32
+    }
+
+    /// Controller clocks per bit.
+    pub const fn clocks_per_bit(&self) -> u32 {
+        self.prescaler as u32 * self.quanta()
+    }
+
+    /// The bit rate in bit/s, rounded.
+    pub const fn bitrate_bps(&self, clock_hz: u32) -> u32 {
+        rate_of(clock_hz, self.clocks_per_bit())
+    }
+
+    /// The sample point in per mille of the bit.
+    pub const fn sample_point_permille(&self) -> u32 {
+        (1 + self.segment1 as u32) * 1000 / self.quanta()
+    }
+
+    /// The sample point that CiA recommends for a bit rate, in per mille (CiA 301, bit rates; the
+    /// Linux kernel's defaults for the rates between).
+    pub const fn recommended_sample_point_permille(bitrate_bps: u32) -> u32 {
+        if bitrate_bps > 800_000 {
+            750
+        } else if bitrate_bps > 500_000 {
+            800
+        } else {
+            875
+        }
+    }
+
+    /// Every timing whose bit rate, rounded to whole bit/s, is `bitrate_bps` (so that 83 333 is
+    /// 83 333.3), from the most quanta down, with the widest jump that it allows.
+    pub fn all(clock_hz: u32, bitrate_bps: u32) -> impl Iterator<Item = BitTiming> {
+        let clocks = (clock_hz + bitrate_bps / 2).checked_div(bitrate_bps).unwrap_or(0);
+        let exact = clocks > 0 && rate_of(clock_hz, clocks) == bitrate_bps;
+        Self::of_clocks(if exact { clocks } else { 0 })
+    }
+
+    /// Every timing of a bit that is `clocks` controller clocks long.
+    pub fn of_clocks(clocks: u32) -> impl Iterator<Item = BitTiming> {
+        (3..=25u32)
+            .rev()
+            .filter(move |quanta| clocks > 0 && clocks.is_multiple_of(*quanta) && clocks / quanta <= 1024)
+            .flat_map(move |quanta| {
+                (1..=8u32).filter_map(move |segment2| {
+                    let segment1 = quanta.checked_sub(1 + segment2)?;
+                    matches!(segment1, 1..=16).then(|| BitTiming {
+                        prescaler: (clocks / quanta) as u16,
+                        segment1: segment1 as u8,
+                        segment2: segment2 as u8,
+                        jump_width: segment2.min(4) as u8,
+                    })
+                })
+            })
+    }
+
+    /// The timing for a bit rate: nearest to the wanted sample point, then with the most quanta.
+    /// Without a sample point it is CiA's. The jump width is one quantum per eight of the bit, at least
+    /// one: enough for crystals, and not more sensitive to noise than it must be.
+    pub fn choose(
+        clock_hz: u32,
+        bitrate_bps: u32,
+        sample_point_permille: Option<u32>,
+    ) -> Result<Self, NoTiming> {
+        if !(MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&bitrate_bps) {
+            return Err(NoTiming::OutOfRange);
+        }
+        let wanted = sample_point_permille.unwrap_or(Self::recommended_sample_point_permille(bitrate_bps));
+        let mut best: Option<BitTiming> = None;
+        for timing in Self::all(clock_hz, bitrate_bps) {
+            let distance = |timing: &BitTiming| timing.sample_point_permille().abs_diff(wanted);
+            if best.is_none_or(|best| distance(&timing) < distance(&best)) {
+                best = Some(timing);
+            }
+        }
+        match best {
+            Some(best) => {
+                let jump_width = (best.quanta() / 8).clamp(1, best.jump_width as u32) as u8;
+                Ok(BitTiming { jump_width, ..best })
+            }
+            None => Err(Self::nearest(clock_hz, bitrate_bps)),
+        }
+    }
+
+    fn nearest(clock_hz: u32, bitrate_bps: u32) -> NoTiming {
+        let exact = clock_hz / bitrate_bps;
+        let reachable = |clocks: &u32| {
+            let rate = clock_hz / clocks;
+            (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&rate) && Self::of_clocks(*clocks).next().is_some()
+        };
+        let rounded = |clocks| rate_of(clock_hz, clocks);
+        let slowest = clock_hz / MIN_BITRATE_BPS;
+        let fastest = (clock_hz / MAX_BITRATE_BPS).max(1);
+        NoTiming::Unreachable {
+            below_bps: (exact + 1..=slowest).find(reachable).map(rounded),
+            above_bps: (fastest..=exact).rev().find(reachable).map(rounded),
+        }
+    }
+}
+
+/// The bit rate of a bit that is `clocks` controller clocks long, rounded to whole bit/s.
+const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
+    (clock_hz + clocks / 2) / clocks
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The CAN clock of cantap's boards. It divides to every bit rate that CiA lists; the 42 MHz of an
+    /// STM32F405 at full speed do not reach 800 kbit/s.
+    const CLOCK: u32 = 36_000_000;
+
+    #[test]
+    fn every_cia_rate_is_reached_near_its_sample_point() {
+        for (rate, prescaler, segment1, segment2, jump_width) in [
+            (1_000_000, 3, 8, 3, 1),
+            (800_000, 3, 11, 3, 1),
+            (500_000, 9, 6, 1, 1),
+            (250_000, 9, 13, 2, 2),
+            (125_000, 18, 13, 2, 2),
+            (100_000, 45, 6, 1, 1),
+            (83_333, 27, 13, 2, 2),
+            (50_000, 45, 13, 2, 2),
+            (33_333, 135, 6, 1, 1),
+            (20_000, 225, 6, 1, 1),
+            (10_000, 225, 13, 2, 2),
+            (5_000, 450, 13, 2, 2),
+        ] {
+            let timing = BitTiming { prescaler, segment1, segment2, jump_width };
+            assert_eq!(BitTiming::choose(CLOCK, rate, None), Ok(timing));
+            assert!(timing.is_valid());
+            assert_eq!(timing.bitrate_bps(CLOCK), rate);
+        }
+    }
+
+    #[test]
+    fn an_unreachable_rate_names_its_neighbours() {
+        assert_eq!(
+            BitTiming::choose(CLOCK, 999_999, None),
+            Err(NoTiming::Unreachable { below_bps: Some(947_368), above_bps: Some(1_000_000) })
+        );
+        assert_eq!(BitTiming::choose(CLOCK, 1_000_001, None), Err(NoTiming::OutOfRange));
+    }
+}

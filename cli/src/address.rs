@@ -1,0 +1,207 @@
+//! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`.
+
+use std::borrow::Borrow;
+use std::fmt;
+use std::ops::Deref;
+use std::str::FromStr;
+
+use anyhow::Context;
+use cantap::Device;
+#[cfg(feature = "emu")]
+use cantap::device::Link;
+use cantap_virtual::Options;
+
+/// The address of a device, as users type it after `-d`.
+#[derive(Clone, Debug)]
+pub struct Address {
+    /// As typed.
+    text: String,
+    place: Place,
+}
+
+/// What an address names.
+#[derive(Clone, Debug)]
+enum Place {
+    /// The serial port that the address is the name of.
+    Serial,
+    /// The virtual device.
+    Virtual(Box<Options>),
+    /// A firmware ELF on the emulated board.
+    #[cfg(feature = "emu")]
+    Emulated(Box<cantap_sim::address::Address>),
+}
+
+/// Why a text is no device address.
+#[derive(Debug, thiserror::Error)]
+pub enum AddressError {
+    /// It is not one.
+    #[error("'{address}' is not a device address: {reason}")]
+    Bad {
+        /// As it was given.
+        address: String,
+        /// What is wrong with it and what would be right.
+        reason: String,
+    },
+    /// An option in it is none of that device's.
+    #[error("'{address}' is not a device address: {reason}")]
+    Option {
+        /// As it was given.
+        address: String,
+        /// What is wrong with it and what would be right.
+        reason: String,
+    },
+    /// This build cannot do it.
+    #[cfg(not(feature = "emu"))]
+    #[error("this build of cantap has no support for '{0}'; build it with the feature `emu`")]
+    NotBuilt(String),
+}
+
+impl FromStr for Address {
+    type Err = AddressError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let bad = |reason: &str| AddressError::Bad { address: text.to_owned(), reason: reason.to_owned() };
+        let option =
+            |reason: &str| AddressError::Option { address: text.to_owned(), reason: reason.to_owned() };
+        let place = match text.split_once(':') {
+            _ if text.is_empty() => {
+                return Err(bad("it is empty; `cantap list` shows devices, `virtual` needs none"));
+            }
+            None if text == "virtual" => Place::Virtual(Box::default()),
+            Some(("virtual", options)) => {
+                let options =
+                    options.parse().map_err(|error: cantap_virtual::BadOption| option(&error.to_string()))?;
+                Place::Virtual(Box::new(options))
+            }
+            Some(("emu", "")) => return Err(bad("name the firmware, as in emu:firmware.elf")),
+            None if text == "emu" => return Err(bad("name the firmware, as in emu:firmware.elf")),
+            #[cfg(feature = "emu")]
+            Some(("emu", file)) => {
+                let board = file
+                    .parse()
+                    .map_err(|error: cantap_sim::address::AddressError| option(&error.to_string()))?;
+                Place::Emulated(Box::new(board))
+            }
+            #[cfg(not(feature = "emu"))]
+            Some(("emu", _)) => return Err(AddressError::NotBuilt(text.to_owned())),
+            Some(("tcp", _)) => return Err(bad("devices over TCP are not supported; use a serial port")),
+            _ => Place::Serial,
+        };
+        Ok(Self { text: text.strip_suffix("virtual:").map_or(text, |_| "virtual").to_owned(), place })
+    }
+}
+
+impl Address {
+    /// The virtual device with `options`, which are nowhere typed.
+    pub fn of_virtual_device() -> Self {
+        Self { text: "virtual".to_owned(), place: Place::Virtual(Box::default()) }
+    }
+
+    /// Whether a device there can have a configuration saved from before: not a virtual one without a file for it.
+    pub fn may_have_saved(&self) -> bool {
+        !matches!(&self.place, Place::Virtual(options) if options.settings.is_none())
+    }
+
+    /// Whether a device there can go and come back: one that lives in this process cannot.
+    pub const fn may_come_back(&self) -> bool {
+        matches!(self.place, Place::Serial)
+    }
+
+    /// Begins a session with the board of a serial number, wherever it is plugged in now, as far as the system tells; else with
+    /// whatever is at the address.
+    pub fn open_again(&self, serial_number: Option<&str>) -> anyhow::Result<OpenDevice> {
+        match serial_number.filter(|_| self.may_come_back()).and_then(cantap::device::port_of) {
+            Some(port) => Ok(OpenDevice { device: Device::open(&port)?, takes_any_bit_rate: false }),
+            None => self.open(),
+        }
+    }
+
+    /// Begins a session with the device.
+    pub fn open(&self) -> anyhow::Result<OpenDevice> {
+        let device = match &self.place {
+            Place::Serial => Device::open(&self.text)?,
+            Place::Virtual(options) => {
+                let connection = cantap_virtual::start((**options).clone())
+                    .context("the system refused a thread; close other programs and try again")?;
+                Device::over(connection.into_link(), &self.text)?
+            }
+            #[cfg(feature = "emu")]
+            Place::Emulated(board) => {
+                let port = (**board)
+                    .clone()
+                    .open()
+                    .with_context(|| format!("the emulated board at '{self}' does not start"))?;
+                Device::over(Link::new(port.reader, port.writer).keeping(port.device), &self.text)?
+            }
+        };
+        Ok(OpenDevice { device, takes_any_bit_rate: matches!(self.place, Place::Virtual(_)) })
+    }
+}
+
+impl PartialEq for Address {
+    fn eq(&self, other: &Self) -> bool {
+        self.text == other.text
+    }
+}
+
+impl fmt::Display for Address {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.text)
+    }
+}
+
+/// A device in a session, and what only its address tells about it.
+pub struct OpenDevice {
+    device: Device,
+    takes_any_bit_rate: bool,
+}
+
+impl OpenDevice {
+    /// Whether its buses have the bit rate of whoever opens a channel.
+    pub const fn takes_any_bit_rate(&self) -> bool {
+        self.takes_any_bit_rate
+    }
+}
+
+impl Borrow<Device> for OpenDevice {
+    fn borrow(&self) -> &Device {
+        &self.device
+    }
+}
+
+impl Deref for OpenDevice {
+    type Target = Device;
+
+    fn deref(&self) -> &Device {
+        &self.device
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_round_trip_and_bad_ones_say_what_would_be_right() {
+        for text in ["/dev/ttyACM0", "COM5", "virtual", "virtual:load=50"] {
+            assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
+        }
+        assert_eq!("virtual:".parse::<Address>().unwrap().to_string(), "virtual");
+        for text in ["", "emu", "emu:", "tcp:1.2.3.4", "virtual:speed=9"] {
+            assert!(text.parse::<Address>().is_err(), "{text}");
+        }
+    }
+
+    #[cfg(feature = "emu")]
+    #[test]
+    fn an_emulated_address_round_trips() {
+        assert_eq!("emu:a.elf,load=5".parse::<Address>().unwrap().to_string(), "emu:a.elf,load=5");
+    }
+
+    #[test]
+    fn only_a_virtual_device_with_a_file_for_it_has_saved_anything() {
+        let may = |text: &str| text.parse::<Address>().unwrap().may_have_saved();
+        assert!(may("/dev/ttyACM0") && may("virtual:settings=a.bin"));
+        assert!(!may("virtual") && !may("virtual:load=5"));
+    }
+}

@@ -1,0 +1,123 @@
+//! What to do about an error of the libraries, in the words of this command: they know no options and no subcommands.
+
+use std::error::Error;
+use std::io;
+
+use cantap::DeviceError;
+use cantap::bit_timing::TimingError;
+use cantap::wire::Refusal;
+use cantap_formats::{Format, OpenError, UnknownFormat};
+use cantap_signals::condition::{ConditionError, ConditionFault};
+
+/// An error and its causes as the user reads them, but for causes that the error itself tells already.
+pub fn sentence(error: &anyhow::Error) -> String {
+    error.chain().fold(String::new(), |text, cause| {
+        let told = told(cause);
+        match text.as_str() {
+            "" => told,
+            before if before.contains(&cause.to_string()) => text,
+            before => format!("{before}: {told}"),
+        }
+    })
+}
+
+/// One error as the user reads it: what happened, and what to do.
+pub fn told(error: &(dyn Error + 'static)) -> String {
+    if let Some(condition) = error.downcast_ref::<ConditionError>() {
+        return of_condition(condition);
+    }
+    let advice = error
+        .downcast_ref()
+        .and_then(of_device)
+        .or_else(|| error.downcast_ref().and_then(of_timing))
+        .or_else(|| unknown_format(error).and_then(of_format));
+    advice.map_or_else(|| error.to_string(), |advice| format!("{error}{advice}"))
+}
+
+fn of_device(error: &DeviceError) -> Option<String> {
+    let advice = match error {
+        DeviceError::NotFound { .. } => "; `cantap list` shows what is connected",
+        DeviceError::Open { .. } => "; check the address with `cantap list`",
+        DeviceError::NotCantap { .. } => {
+            "; check that it is one (`cantap list`), then unplug it and plug it in again"
+        }
+        DeviceError::Vanished { .. } => "; plug it in again",
+        DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",
+        DeviceError::NoChannel { .. } => "; choose one it has with -c",
+        DeviceError::Refused { refusal } => match refusal {
+            Refusal::Unsupported => "; `cantap info` shows what it can",
+            Refusal::BadTiming => "; see `cantap timing`",
+            Refusal::BadSlot => "; `cantap info` shows how many there are",
+            Refusal::ListenOnly => "; open it in normal mode (--mode normal) to send",
+            _ => return None,
+        },
+        _ => return None,
+    };
+    Some(advice.to_owned())
+}
+
+fn of_timing(error: &TimingError) -> Option<String> {
+    let advice = match error {
+        TimingError::JumpWidth { .. } => "; give a smaller --sjw",
+        TimingError::Rate(_) => ", see `cantap timing -b RATE` for what reaches a rate",
+        TimingError::Register(_) => ", and choose loopback or silent with --mode",
+        TimingError::TripleSampling => ": leave --triple away",
+        _ => return None,
+    };
+    Some(advice.to_owned())
+}
+
+/// The format that a name does not tell, wherever that was found out.
+fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFormat> {
+    if let Some(OpenError::Format(unknown)) = error.downcast_ref() {
+        return Some(unknown);
+    }
+    let within = error.downcast_ref::<io::Error>().and_then(io::Error::get_ref);
+    within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
+}
+
+fn of_format(error: &UnknownFormat) -> Option<String> {
+    matches!(error, UnknownFormat::Suffix(_))
+        .then(|| format!("; name it with one of --format {}", Format::names()))
+}
+
+/// The advice stands behind what is wrong, before the condition itself.
+fn of_condition(error: &ConditionError) -> String {
+    let text = error.to_string();
+    match &error.fault {
+        fault @ ConditionFault::NoDatabase(_) => {
+            text.replacen(&fault.to_string(), &format!("{fault}; load one with --db"), 1)
+        }
+        _ => text,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn advice_stands_behind_what_happened_and_causes_are_told_once() {
+        let source = io::Error::other("broken");
+        let error = anyhow::Error::from(DeviceError::Open { address: "X".to_owned(), source: source.into() });
+        assert_eq!(
+            sentence(&error),
+            "'X' cannot be opened as a serial port: broken; check the address with `cantap list`"
+        );
+        let error = DeviceError::Refused { refusal: Refusal::Unsupported };
+        assert_eq!(told(&error), "the device refused: it cannot do that; `cantap info` shows what it can");
+        let error = anyhow::Error::from(TimingError::TripleSampling).context("channel 1");
+        assert!(sentence(&error).starts_with("channel 1: this controller"), "{}", sentence(&error));
+        assert!(sentence(&error).ends_with("in it: leave --triple away"), "{}", sentence(&error));
+    }
+
+    #[test]
+    fn a_name_without_a_format_is_explained_for_reading_and_writing() {
+        let expected = "the name 'a.xyz' does not tell the format; name it with one of --format candump, ";
+        let unknown = || UnknownFormat::Suffix("a.xyz".to_owned());
+        let (read, written) = (OpenError::from(unknown()), io::Error::other(unknown()));
+        for told in [told(&read), told(&written)] {
+            assert!(told.starts_with(expected), "{told}");
+        }
+    }
+}

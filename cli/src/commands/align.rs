@@ -1,0 +1,305 @@
+//! `cantap align`: traces of several recorders that heard the same bus, in one trace on one clock.
+
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use cantap_formats::{Format, LeftOut, ReadOptions, TraceWriter, create_writer, open_reader};
+use cantap_trace::TraceRecord;
+use cantap_trace::align::{Agreement, AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
+use serde_json::{Value, json};
+
+use super::convert::{WriteArgs, refuse_same_file, report};
+use crate::args::duration;
+use crate::exit;
+use crate::input::{ReadArgs, Records};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap align engine.blf cabin.blf -o both.blf\n  \
+    cantap align first.log second.asc third.pcapng\n\n\
+    The clock is found from the frames that the traces share, whatever their dates. All times are then the first \
+    trace's; its channels keep their numbers, and those of the others follow. Without -o, only what was found is \
+    told.\n\n\
+    Exit code 1: the traces have no bus in common, or their frames repeat themselves so that nobody could tell. \
+    With --check, 3 if the stamps of a frame are further apart than that.")]
+pub struct Args {
+    /// The traces; the first one's clock is kept.
+    #[arg(value_name = "TRACE", required = true, num_args = 2..)]
+    traces: Vec<PathBuf>,
+    /// The trace to write, with all channels.
+    #[arg(short, long, value_name = "OUT")]
+    output: Option<PathBuf>,
+    /// The format of the traces, where neither their names nor their beginnings tell.
+    #[arg(long, value_name = "FORMAT")]
+    from: Option<Format>,
+    /// Stop at the first thing in a trace that is wrong instead of leaving it out.
+    #[arg(long)]
+    strict: bool,
+    /// End with 3 if the stamps of any frame are further apart, such as 10us.
+    #[arg(long, value_name = "TIME", value_parser = duration)]
+    check: Option<Duration>,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    write: WriteArgs,
+}
+
+/// One of the traces that are set on the first one's clock.
+struct Other {
+    alignment: Alignment,
+    verifier: Verifier,
+}
+
+/// What was found of it.
+struct Found {
+    alignment: Alignment,
+    agreement: Agreement,
+    /// What is added to its channels.
+    channel_offset: u8,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    for path in &args.traces {
+        if path.as_os_str() == "-" {
+            bail!("a trace is read more than once, which standard input cannot be; write it to a file first");
+        }
+        if let Some(output) = &args.output {
+            refuse_same_file(path, output)?;
+        }
+    }
+    let (alignments, offsets) = find(args)?;
+    let mut merged = Merged::open(args, alignments, &offsets)?;
+    let mut writer = match &args.output {
+        Some(path) => Some(Output::create(path, args)?),
+        None => None,
+    };
+    while let Some(record) = merged.next()? {
+        if let Some(writer) = &mut writer {
+            writer.write(&record)?;
+        }
+    }
+    let left_out = writer.map(Output::finish).transpose()?;
+    let found: Vec<Found> = merged
+        .others
+        .into_iter()
+        .zip(&offsets[1..])
+        .map(|(Other { alignment, verifier }, &channel_offset)| Found {
+            alignment,
+            agreement: verifier.finish(),
+            channel_offset,
+        })
+        .collect();
+    if args.json {
+        println!("{}", to_json(args, &found, left_out.as_ref()));
+    } else {
+        for (path, found) in args.traces[1..].iter().zip(&found) {
+            print(&args.traces[0], path, found);
+        }
+    }
+    let within =
+        |found: &Found| args.check.is_none_or(|most| u128::from(found.agreement.worst_ns) <= most.as_nanos());
+    Ok(if found.iter().all(within) { ExitCode::SUCCESS } else { ExitCode::from(exit::CHECK_FAILED) })
+}
+
+/// How each of the others relates to the first, and what is added to each trace's channels.
+fn find(args: &Args) -> anyhow::Result<(Vec<Alignment>, Vec<u8>)> {
+    let mut unclear = None;
+    'longer: for length in RUN_LENGTHS {
+        let sketches =
+            args.traces.iter().map(|path| sketch(args, path, length)).collect::<anyhow::Result<Vec<_>>>()?;
+        let mut alignments = Vec::new();
+        for (sketch, path) in sketches.iter().zip(&args.traces).skip(1) {
+            match align(&sketches[0], sketch) {
+                Ok(alignment) => alignments.push(alignment),
+                Err(error) => {
+                    unclear = Some((error, path));
+                    continue 'longer;
+                }
+            }
+        }
+        return Ok((alignments, channel_offsets(&sketches)?));
+    }
+    let (error, path) = unclear.unwrap_or((AlignError::NothingInCommon, &args.traces[1]));
+    Err(anyhow::Error::new(error))
+        .with_context(|| format!("{} and {} cannot be aligned", args.traces[0].display(), path.display()))
+}
+
+fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
+    let options = ReadOptions { format: args.from, follow: false, strict: args.strict };
+    let mut reader = open_reader(path, &options)?;
+    let mut sketch = Sketch::new(length);
+    let mut batch = Vec::new();
+    while let Some(read) = reader.next_batch(&mut batch) {
+        match read {
+            Ok(()) => batch.iter().for_each(|record| sketch.add(record)),
+            Err(issue) if args.strict => bail!(issue),
+            // It is told when the trace is read again.
+            Err(_) => {}
+        }
+    }
+    if sketch.frames() == 0 {
+        bail!("{}: no frame could be read; check its format (--from)", path.display());
+    }
+    Ok(sketch)
+}
+
+/// Each trace's channels follow those of the traces before.
+fn channel_offsets(sketches: &[Sketch]) -> anyhow::Result<Vec<u8>> {
+    let mut next = 0_u8;
+    sketches
+        .iter()
+        .map(|sketch| {
+            let offset = next;
+            next = next.checked_add(sketch.highest_channel()).context(
+                "the traces have more than 255 channels together; cut some with cantap convert --channel",
+            )?;
+            Ok(offset)
+        })
+        .collect()
+}
+
+/// All traces as one, in order of the first one's time.
+struct Merged<'a> {
+    sources: Vec<Records>,
+    /// Each source's next record, on the first one's clock.
+    heads: Vec<Option<TraceRecord>>,
+    offsets: &'a [u8],
+    others: Vec<Other>,
+}
+
+impl<'a> Merged<'a> {
+    fn open(args: &Args, alignments: Vec<Alignment>, offsets: &'a [u8]) -> anyhow::Result<Self> {
+        let read = ReadArgs { format: args.from, follow: false, strict: args.strict, filter: Vec::new() };
+        let sources = args.traces.iter().map(|path| read.open(path)).collect::<anyhow::Result<Vec<_>>>()?;
+        let others = alignments
+            .into_iter()
+            .map(|alignment| Other { verifier: Verifier::new(&alignment), alignment })
+            .collect();
+        let mut merged = Self { heads: vec![None; sources.len()], sources, offsets, others };
+        for source in 0..merged.sources.len() {
+            merged.refill(source)?;
+        }
+        Ok(merged)
+    }
+
+    fn refill(&mut self, source: usize) -> anyhow::Result<()> {
+        self.heads[source] = self.sources[source].next()?;
+        if let Some(head) = &mut self.heads[source]
+            && let Some(other) = source.checked_sub(1)
+        {
+            head.time_ns = self.others[other].alignment.map.to_first(head.time_ns);
+        }
+        Ok(())
+    }
+
+    fn next(&mut self) -> anyhow::Result<Option<TraceRecord>> {
+        let heads = self.heads.iter().enumerate();
+        let earliest = heads.filter_map(|(source, head)| head.map(|head| (head.time_ns, source))).min();
+        let Some((_, source)) = earliest else { return Ok(None) };
+        let Some(mut record) = self.heads[source] else { return Ok(None) };
+        match source.checked_sub(1) {
+            None => self.others.iter_mut().for_each(|other| other.verifier.first(&record)),
+            Some(other) => self.others[other].verifier.second(&record),
+        }
+        self.refill(source)?;
+        record.channel = record.channel.saturating_add(self.offsets[source]);
+        Ok(Some(record))
+    }
+}
+
+/// The trace being written.
+struct Output<'a> {
+    path: &'a Path,
+    writer: Box<dyn TraceWriter>,
+}
+
+impl<'a> Output<'a> {
+    fn create(path: &'a Path, args: &Args) -> anyhow::Result<Self> {
+        let options = args.write.options(None)?;
+        let writer = create_writer(path, &options).with_context(|| failed(path))?;
+        Ok(Self { path, writer })
+    }
+
+    fn write(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
+        self.writer.write(record).with_context(|| failed(self.path))
+    }
+
+    fn finish(self) -> anyhow::Result<LeftOut> {
+        let left_out = self.writer.finish().with_context(|| failed(self.path))?;
+        report(&left_out, self.path);
+        Ok(left_out)
+    }
+}
+
+fn failed(path: &Path) -> String {
+    format!("cannot write {}", path.display())
+}
+
+fn print(first: &Path, path: &Path, found: &Found) {
+    let (first, path) = (first.display(), path.display());
+    let Found { alignment, agreement, channel_offset } = found;
+    for (a, b) in &alignment.channels {
+        let now = if *channel_offset == 0 { String::new() } else { format!(" (now {})", b + channel_offset) };
+        println!("channel {b} of {path}{now} is on the bus of channel {a} of {first}");
+    }
+    let steps = match alignment.map.steps() {
+        0 => String::new(),
+        1 => ", and was set once meanwhile".to_owned(),
+        steps => format!(", and was set {steps} times meanwhile"),
+    };
+    println!(
+        "its clock was {:+.6} s from the first one's and gains {:+.3} ppm on it{steps}",
+        -(alignment.map.ahead_ns() as f64) / 1e9,
+        // No minus before a zero.
+        (-alignment.map.drift_ppm() * 1e3).round() / 1e3 + 0.0,
+    );
+    println!(
+        "{} frames in both; of the common time, {} only in {first}, {} only in {path}",
+        agreement.both, agreement.only_first, agreement.only_second
+    );
+    println!(
+        "stamps of the same frame apart: {:.1} us half of them, {:.1} us 99 %, {:.1} us at most",
+        us(agreement.median_ns),
+        us(agreement.most_ns),
+        us(agreement.worst_ns)
+    );
+}
+
+fn us(ns: u64) -> f64 {
+    ns as f64 / 1e3
+}
+
+fn to_json(args: &Args, found: &[Found], left_out: Option<&LeftOut>) -> Value {
+    let traces = args.traces[1..].iter().zip(found).map(|(path, found)| {
+        let Found { alignment, agreement, channel_offset } = found;
+        json!({
+            "trace": path.display().to_string(),
+            "channels": alignment.channels.iter().map(|&(first, own)| json!({
+                "first": first, "own": own, "written": u16::from(own) + u16::from(*channel_offset),
+            })).collect::<Vec<_>>(),
+            "offset_seconds": -(alignment.map.ahead_ns() as f64) / 1e9,
+            "drift_ppm": -alignment.map.drift_ppm(),
+            "clock_set": alignment.map.steps(),
+            "moments": alignment.moments,
+            "frames_in_both": agreement.both,
+            "only_in_first": agreement.only_first,
+            "only_in_this": agreement.only_second,
+            "apart_us": {
+                "median": us(agreement.median_ns),
+                "p99": us(agreement.most_ns),
+                "max": us(agreement.worst_ns),
+            },
+        })
+    });
+    let left_out: serde_json::Map<_, _> = left_out
+        .into_iter()
+        .flat_map(LeftOut::iter)
+        .map(|(what, count)| (what.to_owned(), count.into()))
+        .collect();
+    json!({ "first": args.traces[0].display().to_string(), "traces": traces.collect::<Vec<_>>(), "left_out": left_out })
+}

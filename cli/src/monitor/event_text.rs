@@ -1,0 +1,63 @@
+//! Records in words, and bytes as text.
+
+use std::fmt::Write as _;
+
+use cantap::TraceEvent;
+use cantap::wire::record::LossStage;
+
+use crate::words::{error_name, failure_name, state_name};
+
+/// What a record says that is no frame.
+pub fn event_text(event: &TraceEvent) -> String {
+    let counters = |counters: Option<(u8, u8)>| {
+        counters.map_or(String::new(), |(tec, rec)| format!(", counters {tec} / {rec}"))
+    };
+    match *event {
+        TraceEvent::Frame { .. } => String::new(),
+        TraceEvent::BusError { kind, counters: at } => {
+            format!("E bus error: {}{}", kind.map_or("unknown", error_name), counters(at))
+        }
+        TraceEvent::ErrorsSuppressed { count } => format!("E {count} more bus errors"),
+        TraceEvent::State { state, counters: at } => format!("S {}{}", state_name(state), counters(at)),
+        TraceEvent::Lost { stage, count, at_least } => {
+            format!("L {} frames lost {}", lost(count, at_least), stage.map_or("somewhere", stage_name))
+        }
+        TraceEvent::TransmitFailed { tag, reason } => {
+            format!("F frame {tag} not sent: {}", failure_name(reason))
+        }
+    }
+}
+
+/// How many frames are missing.
+pub fn lost(count: u32, at_least: bool) -> String {
+    match (count, at_least) {
+        // As while a device was gone.
+        (0, true) => "an unknown number of".to_owned(),
+        (count, true) => format!("at least {count}"),
+        (count, false) => count.to_string(),
+    }
+}
+
+fn stage_name(stage: LossStage) -> &'static str {
+    match stage {
+        LossStage::Controller => "in the controller",
+        LossStage::Queue => "in the device's queue",
+        LossStage::Link => "on the way to the host",
+        LossStage::Host => "in the host",
+    }
+}
+
+/// Bytes as pairs of digits.
+pub fn hex(data: &[u8]) -> String {
+    let mut text = String::with_capacity(24);
+    for (index, byte) in data.iter().enumerate() {
+        // Writing to a String cannot fail.
+        let _ = write!(text, "{}{byte:02X}", if index == 0 { "" } else { " " });
+    }
+    text
+}
+
+/// Bytes as characters, dots for those without one.
+pub fn printable(data: &[u8]) -> String {
+    data.iter().map(|byte| if (0x20..0x7F).contains(byte) { *byte as char } else { '.' }).collect()
+}

@@ -1,0 +1,114 @@
+//! Pictures from records as they go by: signals, bus load, periods. Memory does not grow with the trace.
+
+mod load;
+mod signals;
+mod timing;
+
+pub use load::LoadCollector;
+pub use signals::{MOST_CURVES, SignalCollector};
+pub use timing::TimingCollector;
+
+use std::collections::HashMap;
+
+use super::{Axis, Gap};
+use cantap_trace::{TraceEvent, TraceRecord};
+
+/// Gaps that are kept one by one. Behind them, the last one grows.
+const MOST_GAPS: usize = 2000;
+
+/// The horizontal axis of a trace: seconds since its first record.
+#[derive(Clone, Debug, Default)]
+struct TimeAxis {
+    first_ns: Option<i64>,
+}
+
+impl TimeAxis {
+    fn seconds(&mut self, time_ns: i64) -> f64 {
+        let first = *self.first_ns.get_or_insert(time_ns);
+        time_ns.saturating_sub(first) as f64 / 1e9
+    }
+
+    fn axis(&self) -> Axis {
+        // The form that candump's logs have, so that a place in the picture is found in the file.
+        let first = self.first_ns.unwrap_or(0);
+        let zero = if first == 0 {
+            String::new()
+        } else {
+            format!("{}.{:06}", first.div_euclid(1_000_000_000), first.rem_euclid(1_000_000_000) / 1000)
+        };
+        Axis::Time { zero }
+    }
+}
+
+/// Where frames are missing, per channel.
+#[derive(Clone, Debug, Default)]
+struct Gaps {
+    gaps: Vec<Gap>,
+    channels: HashMap<u8, ChannelGap>,
+}
+
+#[derive(Clone, Debug, Default)]
+struct ChannelGap {
+    last_frame: Option<f64>,
+    lost: u64,
+}
+
+impl Gaps {
+    /// Takes a record; returns whether it is a loss.
+    fn push(&mut self, record: &TraceRecord, x: f64) -> bool {
+        let channel = self.channels.entry(record.channel).or_default();
+        match record.event {
+            TraceEvent::Lost { count, .. } => {
+                channel.lost += u64::from(count);
+                true
+            }
+            TraceEvent::Frame { .. } => {
+                let before = channel.last_frame.replace(x).unwrap_or(x);
+                let frames = std::mem::take(&mut channel.lost);
+                if frames > 0 {
+                    // A trace's clock may be set back.
+                    self.add(Gap { from: before.min(x), to: before.max(x), frames });
+                }
+                false
+            }
+            _ => false,
+        }
+    }
+
+    fn add(&mut self, gap: Gap) {
+        let full = self.gaps.len() >= MOST_GAPS;
+        match self.gaps.last_mut() {
+            Some(last) if full => {
+                last.to = last.to.max(gap.to);
+                last.frames += gap.frames;
+            }
+            _ => self.gaps.push(gap),
+        }
+    }
+
+    /// The gaps, with those that reach the trace's end.
+    fn finish(mut self, end: f64) -> Vec<Gap> {
+        for channel in std::mem::take(&mut self.channels).into_values().filter(|channel| channel.lost > 0) {
+            let from = channel.last_frame.unwrap_or(end);
+            self.add(Gap { from, to: end, frames: channel.lost });
+        }
+        self.gaps
+    }
+}
+
+#[cfg(test)]
+mod testing {
+    use super::*;
+    use cantap_trace::Direction;
+
+    pub(super) fn frame(time_ms: i64, text: &str) -> TraceRecord {
+        let frame = text.parse().unwrap();
+        let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+        TraceRecord { time_ns: time_ms * 1_000_000, channel: 1, event }
+    }
+
+    pub(super) fn lost(time_ms: i64, count: u32) -> TraceRecord {
+        let event = TraceEvent::Lost { stage: None, count, at_least: false };
+        TraceRecord { event, ..frame(time_ms, "000#") }
+    }
+}

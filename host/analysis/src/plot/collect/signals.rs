@@ -1,0 +1,254 @@
+//! The curves of signals.
+
+use std::collections::HashMap;
+
+use super::super::model::{Content, Curve, PALETTE, Pane, Plot};
+use super::{Gaps, TimeAxis};
+use cantap_signals::{Decoder, MessageRef, Signal, SignalValue};
+use cantap_trace::TraceRecord;
+
+/// Curves in one picture; more cannot be told apart.
+pub const MOST_CURVES: usize = 24;
+
+/// Collects the curves of the signals that a decoder has selected.
+pub struct SignalCollector<'a> {
+    decoder: &'a Decoder,
+    axis: TimeAxis,
+    gaps: Gaps,
+    end: f64,
+    /// Curve of each signal: channel, message, signal.
+    places: HashMap<(u8, MessageRef, u32), usize>,
+    curves: Vec<Collected>,
+    left_out: u64,
+    values: Vec<SignalValue>,
+}
+
+struct Collected {
+    channel: u8,
+    message: MessageRef,
+    signal: u32,
+    curve: Curve,
+    digital: bool,
+    state: bool,
+}
+
+impl<'a> SignalCollector<'a> {
+    /// Nothing collected yet.
+    pub fn new(decoder: &'a Decoder) -> Self {
+        Self {
+            decoder,
+            axis: TimeAxis::default(),
+            gaps: Gaps::default(),
+            end: 0.0,
+            places: HashMap::new(),
+            curves: Vec::new(),
+            left_out: 0,
+            values: Vec::new(),
+        }
+    }
+
+    /// Takes the next record of the trace.
+    pub fn push(&mut self, record: &TraceRecord) {
+        let x = self.axis.seconds(record.time_ns);
+        self.end = self.end.max(x);
+        if self.gaps.push(record, x) {
+            let of_channel = self.curves.iter_mut().filter(|collected| collected.channel == record.channel);
+            of_channel.for_each(|collected| collected.curve.series.interrupt());
+            return;
+        }
+        let Some(frame) = record.frame() else {
+            return;
+        };
+        let mut values = std::mem::take(&mut self.values);
+        if let Some(message) = self.decoder.decode(record.channel, frame, &mut values) {
+            for value in &values {
+                self.value(record.channel, message, value, x);
+            }
+        }
+        self.values = values;
+    }
+
+    fn value(&mut self, channel: u8, message: MessageRef, value: &SignalValue, x: f64) {
+        let decoder = self.decoder;
+        let Some(signal) = decoder.message(message).signals.get(value.signal as usize) else {
+            return;
+        };
+        let curves = &mut self.curves;
+        let place = match self.places.entry((channel, message, value.signal)) {
+            std::collections::hash_map::Entry::Occupied(place) => *place.get(),
+            std::collections::hash_map::Entry::Vacant(_) if curves.len() == MOST_CURVES => {
+                self.left_out += 1;
+                return;
+            }
+            std::collections::hash_map::Entry::Vacant(vacant) => {
+                curves.push(Collected {
+                    channel,
+                    message,
+                    signal: value.signal,
+                    curve: curve_of(signal),
+                    digital: signal.digital.is_some() || signal.length == 1,
+                    state: false,
+                });
+                *vacant.insert(curves.len() - 1)
+            }
+        };
+        let collected = &mut curves[place];
+        let y = if collected.digital {
+            collected.state = match signal.digital {
+                Some(digital) => digital.state(collected.state, value.value),
+                None => value.raw != 0,
+            };
+            f64::from(u8::from(collected.state))
+        } else {
+            value.value
+        };
+        collected.curve.series.push(x, y);
+    }
+
+    /// Values of signals that found no room among [`MOST_CURVES`].
+    pub fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Whether any signal was seen.
+    pub fn is_empty(&self) -> bool {
+        self.curves.is_empty()
+    }
+
+    /// The picture: a pane per unit (and per so many curves as there are colours), one per signal without a unit, and a last one for digital signals.
+    pub fn finish(mut self, title: String) -> Plot {
+        self.name_curves();
+        let mut panes: Vec<Pane> = Vec::new();
+        let mut digital = Vec::new();
+        // Signals come in the order of their first frames; by message and place they are easier to find.
+        self.curves.sort_by_key(|collected| (collected.channel, collected.message, collected.signal));
+        for collected in self.curves {
+            let signal = &self.decoder.message(collected.message).signals[collected.signal as usize];
+            if collected.digital {
+                digital.push(collected.curve);
+                continue;
+            }
+            let has_room = |pane: &&mut Pane| {
+                !signal.unit.is_empty()
+                    && pane.label == signal.unit
+                    && pane.content.curves().len() < PALETTE.len()
+            };
+            let same_unit = panes.iter_mut().find(has_room);
+            match same_unit.map(|pane| &mut pane.content) {
+                Some(Content::Analogue(curves)) => curves.push(collected.curve),
+                _ => panes.push(Pane {
+                    label: signal.unit.clone(),
+                    range: None,
+                    content: Content::Analogue(vec![collected.curve]),
+                }),
+            }
+        }
+        if !digital.is_empty() {
+            panes.push(Pane { label: String::new(), range: None, content: Content::Digital(digital) });
+        }
+        Plot { title, axis: self.axis.axis(), panes, gaps: self.gaps.finish(self.end) }
+    }
+
+    /// The signal's name; with its message and channel where it would not be the only one.
+    fn name_curves(&mut self) {
+        let names: Vec<_> = self
+            .curves
+            .iter()
+            .map(|collected| {
+                let message = self.decoder.message(collected.message);
+                let name = &message.signals[collected.signal as usize].name;
+                (name.clone(), format!("{}.{name}", message.name), collected.channel)
+            })
+            .collect();
+        for (index, (name, full, channel)) in names.iter().enumerate() {
+            let others =
+                || names.iter().enumerate().filter(|(other, _)| *other != index).map(|(_, name)| name);
+            self.curves[index].curve.name = if others().any(|(_, other, _)| other == full) {
+                format!("{channel}:{full}")
+            } else if others().any(|(other, _, _)| other == name) {
+                full.clone()
+            } else {
+                name.clone()
+            };
+        }
+    }
+}
+
+fn curve_of(signal: &Signal) -> Curve {
+    Curve {
+        colour: signal.colour.map(|colour| [colour.red, colour.green, colour.blue]),
+        // A gear or a state has nothing between its values.
+        stepped: !signal.values.is_empty() || signal.digital.is_some() || signal.length == 1,
+        alarm_below: signal.alarms.min,
+        alarm_above: signal.alarms.max,
+        ..Curve::new(signal.name.clone())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::Gap;
+    use super::super::testing::{frame, lost};
+    use super::*;
+    use cantap_signals::{Database, Digital, Message, Source};
+    use cantap_trace::Id;
+
+    fn decoder() -> Decoder {
+        let signal =
+            |name: &str, start, unit: &str| Signal { unit: unit.to_owned(), ..Signal::new(name, start, 8) };
+        let message = Message {
+            id: Id::standard(0x123).unwrap(),
+            name: "Engine".to_owned(),
+            description: String::new(),
+            length: 4,
+            cycle_ms: None,
+            j1939: false,
+            signals: vec![
+                signal("Oil", 0, "°C"),
+                signal("Water", 8, "°C"),
+                signal("Speed", 16, "km/h"),
+                Signal { digital: Some(Digital { low: 10.0, high: 20.0 }), ..signal("Warm", 0, "") },
+            ],
+            line: 0,
+        };
+        let database = Database { messages: vec![message], ..Database::default() };
+        Decoder::new(vec![Source { channel: None, database }])
+    }
+
+    #[test]
+    fn signals_of_a_unit_share_a_pane_and_digital_ones_have_their_own() {
+        let decoder = decoder();
+        let mut collector = SignalCollector::new(&decoder);
+        for (time, text) in [(0, "123#05.10.00"), (10, "123#19.11.01"), (20, "123#0F.12.02"), (25, "456#00")]
+        {
+            collector.push(&frame(time, text));
+        }
+        let plot = collector.finish("Engine".to_owned());
+        let labels: Vec<_> = plot.panes.iter().map(|pane| pane.label.as_str()).collect();
+        assert_eq!(labels, ["°C", "km/h", ""]);
+        let names: Vec<_> = plot.panes[0].content.curves().iter().map(|curve| curve.name.as_str()).collect();
+        assert_eq!(names, ["Oil", "Water"]);
+        let Content::Digital(digital) = &plot.panes[2].content else { panic!("{:?}", plot.panes[2]) };
+        // Off, on above the upper threshold, and still on between the two.
+        let states: Vec<_> = digital[0].series.points().iter().map(|point| point.y).collect();
+        assert_eq!(states, [0.0, 1.0, 1.0]);
+    }
+
+    #[test]
+    fn a_loss_interrupts_curves_and_is_shaded_between_the_frames_around_it() {
+        let decoder = decoder();
+        let mut collector = SignalCollector::new(&decoder);
+        for record in [frame(0, "123#01"), frame(10, "123#02"), lost(12, 7), frame(30, "123#03"), lost(35, 2)]
+        {
+            collector.push(&record);
+        }
+        let plot = collector.finish(String::new());
+        let gaps = [Gap { from: 0.01, to: 0.03, frames: 7 }, Gap { from: 0.03, to: 0.035, frames: 2 }];
+        assert_eq!(plot.gaps, gaps);
+        let points = plot.panes[0].content.curves()[0].series.points();
+        assert_eq!(
+            points.iter().map(|point| point.y.is_nan()).collect::<Vec<_>>(),
+            [false, false, true, false, true]
+        );
+    }
+}

@@ -1,0 +1,156 @@
+//! What is to be seen: panes above each other that share a horizontal axis.
+
+use super::histogram::Bar;
+use super::scale::Range;
+use super::series::Series;
+
+/// A picture.
+#[derive(Clone, Debug, Default)]
+pub struct Plot {
+    /// What it shows, above everything.
+    pub title: String,
+    /// The horizontal axis of all panes.
+    pub axis: Axis,
+    /// The panes, the uppermost first.
+    pub panes: Vec<Pane>,
+    /// Where frames are missing, shaded on every pane.
+    pub gaps: Vec<Gap>,
+}
+
+/// What the horizontal axis shows.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Axis {
+    /// Time in seconds.
+    Time {
+        /// What zero is, such as a date; may be empty.
+        zero: String,
+    },
+    /// Anything else, with its unit.
+    Value {
+        /// What it is, such as `period in ms`.
+        label: String,
+    },
+}
+
+impl Default for Axis {
+    fn default() -> Self {
+        Self::Time { zero: String::new() }
+    }
+}
+
+/// A place where frames are missing.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Gap {
+    /// The last thing known before it, on the horizontal axis.
+    pub from: f64,
+    /// The first thing known after it.
+    pub to: f64,
+    /// How many frames, as far as known.
+    pub frames: u64,
+}
+
+/// One of the areas above each other.
+#[derive(Clone, Debug)]
+pub struct Pane {
+    /// What its vertical axis shows, such as a unit; may be empty.
+    pub label: String,
+    /// The vertical range; by the data where there is none.
+    pub range: Option<(f64, f64)>,
+    /// What is in it.
+    pub content: Content,
+}
+
+/// What a pane shows.
+#[derive(Clone, Debug)]
+pub enum Content {
+    /// Curves over a common vertical axis.
+    Analogue(Vec<Curve>),
+    /// Signals that are on (1) or off (0), one above the other.
+    Digital(Vec<Curve>),
+    /// How often something was between two values.
+    Bars(Vec<Bar>),
+}
+
+impl Content {
+    /// The curves, if it has any.
+    pub fn curves(&self) -> &[Curve] {
+        match self {
+            Self::Analogue(curves) | Self::Digital(curves) => curves,
+            Self::Bars(_) => &[],
+        }
+    }
+}
+
+/// One signal.
+#[derive(Clone, Debug)]
+pub struct Curve {
+    /// Its name, for the legend.
+    pub name: String,
+    /// Its colour as red, green, blue; chosen from a palette for colour-blind eyes where there is none.
+    pub colour: Option<[u8; 3]>,
+    /// Its points. Between them a line is drawn, or for a stepped curve the value before.
+    pub series: Series,
+    /// Keeps its value until the next point instead of moving there in a line.
+    pub stepped: bool,
+    /// Below this value it is an alarm: shaded blue.
+    pub alarm_below: Option<f64>,
+    /// Above this value it is an alarm: shaded red.
+    pub alarm_above: Option<f64>,
+}
+
+impl Curve {
+    /// A curve without points.
+    pub fn new(name: impl Into<String>) -> Self {
+        Self {
+            name: name.into(),
+            colour: None,
+            series: Series::default(),
+            stepped: false,
+            alarm_below: None,
+            alarm_above: None,
+        }
+    }
+}
+
+impl Plot {
+    /// The horizontal range of everything in it; zero to one where there is nothing.
+    pub(super) fn span(&self) -> (f64, f64) {
+        let mut span = Range::default();
+        for pane in &self.panes {
+            for curve in pane.content.curves() {
+                for point in curve.series.points() {
+                    span.include(point.x);
+                }
+            }
+            if let Content::Bars(bars) = &pane.content {
+                // A clock's ticks, all alike, are one bar and no wall.
+                for bar in bars {
+                    span.include(bar.from - 10.0 * (bar.to - bar.from));
+                    span.include(bar.to + 10.0 * (bar.to - bar.from));
+                }
+            }
+        }
+        for gap in &self.gaps {
+            span.include(gap.from);
+            span.include(gap.to);
+        }
+        span.or_unit()
+    }
+}
+
+/// Colours that all eyes can tell apart (Okabe and Ito, "Color Universal Design", 2008), without its yellow,
+/// which is too pale on white.
+pub(super) const PALETTE: [[u8; 3]; 7] = [
+    [0x00, 0x72, 0xB2],
+    [0xD5, 0x5E, 0x00],
+    [0x00, 0x9E, 0x73],
+    [0xCC, 0x79, 0xA7],
+    [0x56, 0xB4, 0xE9],
+    [0xE6, 0x9F, 0x00],
+    [0x33, 0x33, 0x33],
+];
+
+/// The colour of the curve that is `index`th in the whole plot.
+pub(super) fn colour_of(curve: &Curve, index: usize) -> [u8; 3] {
+    curve.colour.unwrap_or(PALETTE[index % PALETTE.len()])
+}

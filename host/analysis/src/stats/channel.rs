@@ -1,0 +1,315 @@
+//! What one channel did.
+
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+
+use super::ids::{IdStatistics, Ids};
+use super::windows::{Window, Windows, per_second};
+use super::work_load::WorkLoad;
+use cantap_trace::bits::bits_on_bus;
+use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
+
+/// Statistics of one channel.
+#[derive(Clone, Debug)]
+pub struct ChannelStatistics {
+    /// The channel, from 1.
+    pub number: u8,
+    /// Its bit rate in bit/s, if known.
+    pub bitrate_bps: Option<u32>,
+    /// Frames, sent and received.
+    pub frames: u64,
+    /// Those that the device sent.
+    pub sent: u64,
+    /// Those with a 29-bit identifier.
+    pub extended: u64,
+    /// Remote frames.
+    pub remote: u64,
+    /// Frames whose time is only an upper bound.
+    pub late: u64,
+    /// Bits of all frames, with stuff bits and intermission.
+    pub bits: u64,
+    /// Data bytes of all frames.
+    pub data_bytes: u64,
+    /// Ends of the first and the last frame, in nanoseconds.
+    pub span_ns: Option<(i64, i64)>,
+    /// Records whose time lies before that of the record before.
+    pub out_of_order: u64,
+    /// Work load; `None` without a bit rate.
+    pub load: Option<WorkLoad>,
+    /// Errors on the bus.
+    pub errors: Errors,
+    /// Frames that are missing.
+    pub losses: Losses,
+    /// The controller's state, if it was reported.
+    pub state: Option<ErrorState>,
+    /// How often it changed.
+    pub state_changes: u64,
+    /// The controller's transmit and receive error counters, if they were reported.
+    pub counters: Option<(u8, u8)>,
+    /// Frames that were to be sent and were not.
+    pub transmit_failures: u64,
+    windows: Windows,
+    ids: Ids,
+    latest_ns: i64,
+    gaps: u32,
+    first_bits: u64,
+    latest_frame_ns: Option<i64>,
+    /// Time between frames, where it went forward.
+    covered_ns: u64,
+}
+
+/// Errors that a channel's controller saw.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Errors {
+    /// By kind, in the order of [`BusErrorKind`].
+    pub by_kind: [u64; 6],
+    /// Of unknown kind.
+    pub unknown: u64,
+    /// Counted but not reported one by one.
+    pub suppressed: u64,
+}
+
+impl Errors {
+    /// All of them.
+    pub fn total(&self) -> u64 {
+        self.by_kind.iter().sum::<u64>() + self.unknown + self.suppressed
+    }
+
+    /// Those of one kind.
+    pub fn of(&self, kind: BusErrorKind) -> u64 {
+        self.by_kind[kind as usize]
+    }
+}
+
+/// Frames that are missing from a channel.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Losses {
+    /// By stage, in the order of [`LossStage`].
+    pub by_stage: [u64; 4],
+    /// By a stage that the trace does not name.
+    pub unknown: u64,
+    /// Places in the trace where frames are missing.
+    pub gaps: u64,
+    /// Whether there may be more: a hardware overrun cannot count.
+    pub at_least: bool,
+}
+
+impl Losses {
+    /// All of them.
+    pub fn total(&self) -> u64 {
+        self.by_stage.iter().sum::<u64>() + self.unknown
+    }
+
+    /// Those that one stage lost.
+    pub fn of(&self, stage: LossStage) -> u64 {
+        self.by_stage[stage as usize]
+    }
+}
+
+impl ChannelStatistics {
+    pub(super) fn new(
+        number: u8,
+        bitrate_bps: Option<u32>,
+        has_load: bool,
+        origin_ns: i64,
+        window_ns: u64,
+        peaks: usize,
+    ) -> Self {
+        let load_of_bps = bitrate_bps.filter(|_| has_load);
+        Self {
+            number,
+            bitrate_bps,
+            frames: 0,
+            sent: 0,
+            extended: 0,
+            remote: 0,
+            late: 0,
+            bits: 0,
+            data_bytes: 0,
+            span_ns: None,
+            out_of_order: 0,
+            load: load_of_bps.map(WorkLoad::new),
+            errors: Errors::default(),
+            losses: Losses::default(),
+            state: None,
+            state_changes: 0,
+            counters: None,
+            transmit_failures: 0,
+            windows: Windows::new(number, origin_ns, window_ns, load_of_bps, peaks),
+            ids: Ids::default(),
+            latest_ns: i64::MIN,
+            gaps: 0,
+            first_bits: 0,
+            latest_frame_ns: None,
+            covered_ns: 0,
+        }
+    }
+
+    #[inline]
+    pub(super) fn push(&mut self, record: &TraceRecord, closed: &mut impl FnMut(&Window)) {
+        let time_ns = record.time_ns;
+        if time_ns < self.latest_ns {
+            self.out_of_order += 1;
+        }
+        self.latest_ns = time_ns;
+        if matches!(record.event, TraceEvent::Lost { .. }) {
+            self.interrupt();
+        }
+        self.windows.advance(time_ns, closed);
+        if record.event == TraceEvent::GAP {
+            self.suspend();
+        }
+        match record.event {
+            TraceEvent::Frame { frame, direction, late } => {
+                self.frame(&frame, direction, late, time_ns, closed);
+            }
+            TraceEvent::BusError { kind, counters } => {
+                match kind {
+                    Some(kind) => self.errors.by_kind[kind as usize] += 1,
+                    None => self.errors.unknown += 1,
+                }
+                self.counters = counters.or(self.counters);
+                self.windows.errors(1);
+            }
+            TraceEvent::ErrorsSuppressed { count } => {
+                self.errors.suppressed += u64::from(count);
+                self.windows.errors(u64::from(count));
+            }
+            TraceEvent::State { state, counters } => {
+                self.state_changes += u64::from(self.state != Some(state));
+                self.state = Some(state);
+                self.counters = counters.or(self.counters);
+            }
+            TraceEvent::Lost { stage, count, at_least } => {
+                match stage {
+                    Some(stage) => self.losses.by_stage[stage as usize] += u64::from(count),
+                    None => self.losses.unknown += u64::from(count),
+                }
+                self.losses.gaps += 1;
+                self.losses.at_least |= at_least;
+                self.windows.lost(u64::from(count));
+            }
+            TraceEvent::TransmitFailed { reason, .. } => {
+                self.transmit_failures += match reason {
+                    TransmitFailure::Overtaken { periods } => u64::from(periods),
+                    _ => 1,
+                };
+            }
+        }
+    }
+
+    #[inline]
+    fn frame(
+        &mut self,
+        frame: &Frame,
+        direction: Direction,
+        late: bool,
+        end_ns: i64,
+        closed: &mut impl FnMut(&Window),
+    ) {
+        let bits = bits_on_bus(frame);
+        self.frames += 1;
+        self.bits += u64::from(bits);
+        self.data_bytes += frame.data_len() as u64;
+        self.sent += u64::from(direction == Direction::Tx);
+        self.extended += u64::from(frame.id().is_extended());
+        self.remote += u64::from(frame.is_remote());
+        self.late += u64::from(late);
+        if self.span_ns.is_none() {
+            self.first_bits = u64::from(bits);
+        }
+        let (first, last) = self.span_ns.unwrap_or((end_ns, end_ns));
+        let interval = self.latest_frame_ns.map_or(0, |before| end_ns.saturating_sub(before));
+        self.latest_frame_ns = Some(end_ns);
+        self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
+        self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
+        if let Some(load) = &mut self.load {
+            load.frame(end_ns, bits);
+        }
+        self.windows.frame(end_ns, bits, closed);
+        self.ids.add(frame, direction, bits, end_ns, self.gaps);
+    }
+
+    /// The interval from the last frame to the next one says nothing.
+    fn interrupt(&mut self) {
+        self.gaps = self.gaps.wrapping_add(1);
+        self.windows.gap();
+        if let Some(load) = &mut self.load {
+            load.gap();
+        }
+    }
+
+    /// Nothing at all is known about the time from the last record to the next one.
+    pub(super) fn suspend(&mut self) {
+        self.interrupt();
+        self.latest_frame_ns = None;
+        self.windows.suspend();
+    }
+
+    pub(super) fn advance(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        // Only a record's own time may say that the clock was set back, or that a suspended time is over.
+        if now_ns > self.latest_ns && !self.windows.is_suspended() {
+            self.windows.advance(now_ns, closed);
+        }
+    }
+
+    pub(super) fn finish(&mut self, now_ns: i64, closed: &mut impl FnMut(&Window)) {
+        self.windows.finish(now_ns, closed);
+    }
+
+    /// From the first frame's end to the last one's, in nanoseconds; where the trace's clock was set back (two
+    /// logs were joined), the sum of its parts.
+    pub fn covered_ns(&self) -> u64 {
+        self.covered_ns
+    }
+
+    /// Bits of the first frame, which lie before [`Self::span_ns`].
+    pub(super) fn first_bits(&self) -> u64 {
+        self.first_bits
+    }
+
+    /// Frames per second from the first to the last: intervals over time.
+    pub fn frames_per_s(&self) -> f64 {
+        per_second(self.frames.saturating_sub(1), self.covered_ns)
+    }
+
+    /// Least and mean load of the whole windows that are over and from which no frame is missing, in per cent; `None`
+    /// without a bit rate or such a window.
+    pub fn window_least_and_mean_pct(&self) -> Option<(f64, f64)> {
+        self.windows.least_and_mean_pct()
+    }
+
+    /// Largest load of a whole window that is over, in per cent: a lower bound, if frames are missing from it.
+    pub fn window_largest_pct(&self) -> Option<f64> {
+        self.windows.largest_pct()
+    }
+
+    /// The busiest windows that are over, the busiest first.
+    pub fn peaks(&self) -> impl Iterator<Item = &Window> {
+        self.windows.peaks()
+    }
+
+    /// The window that is running, as far as `now_ns`.
+    pub fn running_window(&self, now_ns: i64) -> Window {
+        self.windows.running(now_ns)
+    }
+
+    /// What each identifier did, in order of appearance. At most [`MOST_IDS`](super::MOST_IDS).
+    pub fn ids(&self) -> impl Iterator<Item = &IdStatistics> {
+        self.ids.iter()
+    }
+
+    /// What one identifier did.
+    pub fn id(&self, id: Id) -> Option<&IdStatistics> {
+        self.ids.get(id)
+    }
+
+    /// How many identifiers are listed.
+    pub fn id_count(&self) -> usize {
+        self.ids.len()
+    }
+
+    /// Frames of identifiers beyond [`MOST_IDS`](super::MOST_IDS).
+    pub fn unlisted_frames(&self) -> u64 {
+        self.ids.unlisted_frames
+    }
+}

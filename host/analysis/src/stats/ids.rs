@@ -1,0 +1,282 @@
+//! What each identifier does: how often it comes, how evenly, and how long it is.
+
+use std::collections::HashMap;
+use std::hash::{BuildHasherDefault, Hasher};
+
+use cantap_trace::{Direction, Frame, Id};
+
+/// Identifiers that are followed one by one on each channel. Random or hostile traffic may have half a
+/// billion; the frames of those beyond this number are counted together.
+pub const MOST_IDS: usize = 65_536;
+
+/// The intervals between one identifier's frames.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Period {
+    count: u64,
+    min_ns: i64,
+    max_ns: i64,
+    /// The first interval. Deviations are summed relative to it, or their squares would cancel.
+    base_ns: i64,
+    sum: f64,
+    squares: f64,
+}
+
+impl Period {
+    #[inline]
+    fn add(&mut self, interval_ns: i64) {
+        if self.count == 0 {
+            self.base_ns = interval_ns;
+            self.min_ns = interval_ns;
+            self.max_ns = interval_ns;
+        }
+        self.count += 1;
+        self.min_ns = self.min_ns.min(interval_ns);
+        self.max_ns = self.max_ns.max(interval_ns);
+        let deviation = interval_ns.saturating_sub(self.base_ns) as f64;
+        self.sum += deviation;
+        self.squares += deviation * deviation;
+    }
+
+    /// How many intervals were measured.
+    pub fn count(&self) -> u64 {
+        self.count
+    }
+
+    /// The shortest, in nanoseconds.
+    pub fn min_ns(&self) -> Option<i64> {
+        (self.count > 0).then_some(self.min_ns)
+    }
+
+    /// The longest, in nanoseconds.
+    pub fn max_ns(&self) -> Option<i64> {
+        (self.count > 0).then_some(self.max_ns)
+    }
+
+    /// Their mean, in nanoseconds.
+    pub fn mean_ns(&self) -> Option<f64> {
+        (self.count > 0).then(|| self.base_ns as f64 + self.sum / self.count as f64)
+    }
+
+    /// Their standard deviation, in nanoseconds: the jitter.
+    pub fn jitter_ns(&self) -> Option<f64> {
+        let count = self.count as f64;
+        (self.count > 0).then(|| {
+            let mean = self.sum / count;
+            (self.squares / count - mean * mean).max(0.0).sqrt()
+        })
+    }
+}
+
+/// What one identifier did on one channel.
+#[derive(Clone, Copy, Debug)]
+pub struct IdStatistics {
+    /// The identifier.
+    pub id: Id,
+    /// Its frames, remote frames too.
+    pub frames: u64,
+    /// Its remote frames.
+    pub remote: u64,
+    /// Its frames that the device sent itself.
+    pub sent: u64,
+    /// Bits that they took, with stuff bits and intermission.
+    pub bits: u64,
+    /// Intervals between its frames. An interval in which frames were lost on the channel is left out.
+    pub period: Period,
+    /// End of the first frame, in nanoseconds.
+    pub first_ns: i64,
+    /// End of the last frame, in nanoseconds.
+    pub last_ns: i64,
+    /// The last DLC, as on the bus.
+    pub dlc: u8,
+    /// Bit n is set if DLC n was seen.
+    pub dlcs_seen: u16,
+    /// How often a frame's DLC differed from the one before.
+    pub dlc_changes: u64,
+    /// Which gap of the channel came before its last frame.
+    generation: u32,
+}
+
+impl IdStatistics {
+    fn new(frame: &Frame, end_ns: i64, generation: u32) -> Self {
+        Self {
+            id: frame.id(),
+            frames: 0,
+            remote: 0,
+            sent: 0,
+            bits: 0,
+            period: Period::default(),
+            first_ns: end_ns,
+            last_ns: end_ns,
+            dlc: frame.dlc(),
+            dlcs_seen: 0,
+            dlc_changes: 0,
+            generation,
+        }
+    }
+
+    #[inline]
+    fn add(&mut self, frame: &Frame, direction: Direction, bits: u32, end_ns: i64, generation: u32) {
+        if self.frames > 0 && self.generation == generation {
+            let interval = end_ns.saturating_sub(self.last_ns);
+            if interval >= 0 {
+                self.period.add(interval);
+            }
+        }
+        self.frames += 1;
+        self.remote += u64::from(frame.is_remote());
+        self.sent += u64::from(direction == Direction::Tx);
+        self.bits += u64::from(bits);
+        self.last_ns = end_ns;
+        self.generation = generation;
+        self.dlc_changes += u64::from(self.dlc != frame.dlc());
+        self.dlc = frame.dlc();
+        self.dlcs_seen |= 1 << frame.dlc();
+    }
+
+    /// The DLCs that were seen, in ascending order.
+    pub fn dlcs(&self) -> impl Iterator<Item = u8> + use<> {
+        let seen = self.dlcs_seen;
+        (0..16).filter(move |dlc| seen >> dlc & 1 != 0)
+    }
+}
+
+/// All identifiers of one channel.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Ids {
+    place_of: HashMap<u32, u32, BuildHasherDefault<IdHasher>>,
+    listed: Vec<IdStatistics>,
+    /// Frames of identifiers that found no room.
+    pub(super) unlisted_frames: u64,
+}
+
+impl Ids {
+    #[inline]
+    pub(super) fn add(
+        &mut self,
+        frame: &Frame,
+        direction: Direction,
+        bits: u32,
+        end_ns: i64,
+        generation: u32,
+    ) {
+        let id = frame.id();
+        let key = id.raw() | u32::from(id.is_extended()) << 31;
+        let place = match self.place_of.get(&key) {
+            Some(place) => *place as usize,
+            None if self.listed.len() < MOST_IDS => {
+                self.place_of.insert(key, self.listed.len() as u32);
+                self.listed.push(IdStatistics::new(frame, end_ns, generation));
+                self.listed.len() - 1
+            }
+            None => {
+                self.unlisted_frames += 1;
+                return;
+            }
+        };
+        self.listed[place].add(frame, direction, bits, end_ns, generation);
+    }
+
+    pub(super) fn iter(&self) -> impl Iterator<Item = &IdStatistics> {
+        self.listed.iter()
+    }
+
+    pub(super) fn get(&self, id: Id) -> Option<&IdStatistics> {
+        let place = self.place_of.get(&(id.raw() | u32::from(id.is_extended()) << 31))?;
+        self.listed.get(*place as usize)
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.listed.len()
+    }
+}
+
+/// Hashes an identifier by one multiplication: the map is asked once per frame.
+#[derive(Clone, Copy, Debug, Default)]
+struct IdHasher(u64);
+
+impl Hasher for IdHasher {
+    fn finish(&self) -> u64 {
+        self.0
+    }
+
+    fn write(&mut self, bytes: &[u8]) {
+        for byte in bytes {
+            self.write_u32(u32::from(*byte));
+        }
+    }
+
+    fn write_u32(&mut self, value: u32) {
+        // 2^64 divided by the golden ratio (Knuth); the fold brings the good high bits down to the table's index.
+        let product = (self.0 ^ u64::from(value)).wrapping_mul(0x9E37_79B9_7F4A_7C15);
+        self.0 = product ^ product >> 32;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn add(ids: &mut Ids, text: &str, end_ns: i64, generation: u32) {
+        let frame: Frame = text.parse().unwrap();
+        ids.add(&frame, Direction::Rx, 50, end_ns, generation);
+    }
+
+    #[test]
+    fn the_period_is_minimum_mean_maximum_and_standard_deviation() {
+        let mut ids = Ids::default();
+        for end in [0, 10, 22, 30, 40] {
+            add(&mut ids, "123#", end, 0);
+        }
+        let period = &ids.iter().next().unwrap().period;
+        assert_eq!((period.min_ns(), period.mean_ns(), period.max_ns()), (Some(8), Some(10.0), Some(12)));
+        assert!((period.jitter_ns().unwrap() - 2f64.sqrt()).abs() < 1e-9);
+    }
+
+    #[test]
+    fn an_interval_with_a_loss_in_it_is_no_period() {
+        let mut ids = Ids::default();
+        for (end, generation) in [(0, 0), (10, 0), (50, 1), (60, 1)] {
+            add(&mut ids, "123#", end, generation);
+        }
+        let period = &ids.iter().next().unwrap().period;
+        assert_eq!((period.count(), period.max_ns()), (2, Some(10)));
+    }
+
+    #[test]
+    fn one_frame_has_no_period() {
+        let mut ids = Ids::default();
+        add(&mut ids, "123#", 5, 0);
+        let id = ids.iter().next().unwrap();
+        assert_eq!((id.period.min_ns(), id.period.mean_ns(), id.period.jitter_ns()), (None, None, None));
+        assert_eq!((id.first_ns, id.last_ns, id.frames), (5, 5, 1));
+    }
+
+    #[test]
+    fn dlc_changes_are_counted_and_listed() {
+        let mut ids = Ids::default();
+        for text in ["123#00", "123#0000", "123#0000", "123#00", "123#R4"] {
+            add(&mut ids, text, 0, 0);
+        }
+        let id = ids.iter().next().unwrap();
+        assert_eq!((id.dlc, id.dlc_changes, id.remote), (4, 3, 1));
+        assert_eq!(id.dlcs().collect::<Vec<_>>(), [1, 2, 4]);
+    }
+
+    #[test]
+    fn a_standard_and_an_extended_identifier_of_the_same_number_are_two() {
+        let mut ids = Ids::default();
+        add(&mut ids, "123#", 0, 0);
+        add(&mut ids, "00000123#", 0, 0);
+        assert_eq!(ids.len(), 2);
+    }
+
+    #[test]
+    fn more_identifiers_than_there_is_room_for_are_counted_together() {
+        let mut ids = Ids::default();
+        for raw in 0..MOST_IDS as u32 + 10 {
+            let frame = Frame::data_frame(Id::extended_truncated(raw), &[]).unwrap();
+            ids.add(&frame, Direction::Rx, 50, 0, 0);
+        }
+        assert_eq!((ids.len(), ids.unlisted_frames), (MOST_IDS, 10));
+    }
+}

@@ -1,0 +1,215 @@
+//! Statistics of a trace as it goes by: exact bus load, rates, periods, losses and errors, per channel and
+//! per identifier.
+//!
+//! Memory is bounded whatever the trace: nothing is kept per frame. Times must be the frames' ends, as
+//! every source of [`TraceRecord`] gives them. Nothing here is printed; `cantap stats` does that.
+
+mod channel;
+mod ids;
+mod summary;
+mod windows;
+mod work_load;
+
+use std::time::Duration;
+
+use cantap_trace::TraceRecord;
+use cantap_trace::bits::bits_on_bus;
+
+pub use channel::{ChannelStatistics, Errors, Losses};
+pub use ids::{IdStatistics, MOST_IDS, Period};
+pub use summary::{ChannelSummary, ErrorSummary, IdSummary, LoadSummary, LossSummary, PeakSummary, Summary};
+pub use windows::{ERROR_FRAME_BITS, Window, shortest_window_ns};
+pub use work_load::WorkLoad;
+
+/// What to measure with.
+#[derive(Clone, Debug)]
+pub struct Options {
+    /// Bit rate of the channels that [`Self::channel_bitrate_bps`] does not name; without one there is no load.
+    pub bitrate_bps: Option<u32>,
+    /// Bit rates of single channels: channel from 1, bit/s.
+    pub channel_bitrate_bps: Vec<(u8, u32)>,
+    /// Channels, from 1, whose frames came without their data or times: they have no load, whatever their bit rate.
+    pub without_load: Vec<u8>,
+    /// Length of a window.
+    pub window: Duration,
+    /// How many of the busiest windows are kept.
+    pub peaks: usize,
+}
+
+impl Default for Options {
+    /// No bit rate, windows of a second, five peaks.
+    fn default() -> Self {
+        Self {
+            bitrate_bps: None,
+            channel_bitrate_bps: Vec::new(),
+            without_load: Vec::new(),
+            window: SECOND,
+            peaks: 5,
+        }
+    }
+}
+
+impl Options {
+    /// The bit rate of a channel, if known.
+    pub fn bitrate_of(&self, channel: u8) -> Option<u32> {
+        let own = self.channel_bitrate_bps.iter().find(|(number, _)| *number == channel);
+        own.map(|(_, bitrate)| *bitrate).or(self.bitrate_bps)
+    }
+}
+
+/// Why there can be no statistics with these options.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum BadOptions {
+    /// A bit rate of zero.
+    #[error("a bit rate of 0 bit/s is no bit rate; give one such as 500k")]
+    ZeroBitrate,
+    /// A window that one frame outlasts.
+    #[error(
+        "a window must be longer than the longest frame, at {bitrate_bps} bit/s {shortest_us} µs; give a longer one"
+    )]
+    WindowTooShort {
+        /// The slowest channel's bit rate.
+        bitrate_bps: u32,
+        /// The shortest window there, in µs.
+        shortest_us: u64,
+    },
+    /// A window of more than a year.
+    #[error("a window can be a year long at most")]
+    WindowTooLong,
+}
+
+const SECOND: Duration = Duration::from_secs(1);
+const YEAR: Duration = Duration::from_hours(365 * 24);
+
+/// Statistics of all channels of a trace.
+#[derive(Clone, Debug)]
+pub struct Statistics {
+    options: Options,
+    window_ns: u64,
+    first_ns: Option<i64>,
+    last_ns: i64,
+    /// In order of appearance; a trace has one or two.
+    channels: Vec<ChannelStatistics>,
+    /// Place in `channels` of the record before, which is nearly always this record's or the other one.
+    latest: usize,
+}
+
+impl Statistics {
+    /// Nothing seen yet.
+    pub fn new(options: Options) -> Result<Self, BadOptions> {
+        let rates =
+            options.channel_bitrate_bps.iter().map(|(_, bitrate)| *bitrate).chain(options.bitrate_bps);
+        let slowest = rates.min();
+        let window_ns = match u64::try_from(options.window.as_nanos()) {
+            Ok(window_ns) if options.window <= YEAR => window_ns,
+            _ => return Err(BadOptions::WindowTooLong),
+        };
+        if slowest == Some(0) {
+            return Err(BadOptions::ZeroBitrate);
+        }
+        // Without any bit rate a window needs to be no longer than the fastest bus asks for.
+        let bitrate_bps = slowest.unwrap_or(cantap_wire::timing::MAX_BITRATE_BPS);
+        let shortest_ns = shortest_window_ns(bitrate_bps);
+        if window_ns < shortest_ns {
+            return Err(BadOptions::WindowTooShort { bitrate_bps, shortest_us: shortest_ns.div_ceil(1000) });
+        }
+        Ok(Self { options, window_ns, first_ns: None, last_ns: i64::MIN, channels: Vec::new(), latest: 0 })
+    }
+
+    /// Takes the next record of the trace.
+    #[inline]
+    pub fn push(&mut self, record: &TraceRecord) {
+        self.push_with(record, |_| {});
+    }
+
+    /// As [`Self::push`], and hands every window to `closed` when it is over. A window that is over
+    /// is reported when the next frame of its channel comes, or with [`Self::advance_with`].
+    #[inline]
+    pub fn push_with(&mut self, record: &TraceRecord, mut closed: impl FnMut(&Window)) {
+        let place = match self.channels.get(self.latest) {
+            Some(channel) if channel.number == record.channel => self.latest,
+            _ => self.find_channel(record),
+        };
+        self.latest = place;
+        self.last_ns = self.last_ns.max(record.time_ns);
+        self.channels[place].push(record, &mut closed);
+    }
+
+    /// The channel's place, new if it must be.
+    #[cold]
+    fn find_channel(&mut self, record: &TraceRecord) -> usize {
+        if let Some(place) = self.channels.iter().position(|channel| channel.number == record.channel) {
+            return place;
+        }
+        let bitrate = self.options.bitrate_of(record.channel);
+        // Windows begin where the trace's first frame begins, on all channels alike.
+        let origin_ns = *self.first_ns.get_or_insert_with(|| match (record.frame(), bitrate) {
+            (Some(frame), Some(bitrate)) => {
+                let bits = bits_on_bus(frame) - cantap_trace::bits::INTERMISSION_BITS;
+                record.time_ns.saturating_sub(windows::bits_to_ns(u64::from(bits), bitrate) as i64)
+            }
+            _ => record.time_ns,
+        });
+        self.channels.push(ChannelStatistics::new(
+            record.channel,
+            bitrate,
+            !self.options.without_load.contains(&record.channel),
+            origin_ns,
+            self.window_ns,
+            self.options.peaks,
+        ));
+        self.channels.len() - 1
+    }
+
+    /// Nothing is known about the time from here to a channel's next record, as while a device was gone: no interval
+    /// and no window that spans it counts for load, rate or period.
+    pub fn interrupt(&mut self) {
+        self.channels.iter_mut().for_each(ChannelStatistics::suspend);
+    }
+
+    /// Time has come to `now_ns` without a record: windows that are over by then are closed.
+    pub fn advance_with(&mut self, now_ns: i64, mut closed: impl FnMut(&Window)) {
+        self.last_ns = if self.channels.is_empty() { self.last_ns } else { self.last_ns.max(now_ns) };
+        for channel in &mut self.channels {
+            channel.advance(now_ns, &mut closed);
+        }
+    }
+
+    /// The trace is over: closes the last windows, cut short where it ends.
+    pub fn finish_with(&mut self, mut closed: impl FnMut(&Window)) {
+        let end = self.last_ns;
+        for channel in &mut self.channels {
+            channel.finish(end, &mut closed);
+        }
+    }
+
+    /// As [`Self::finish_with`], without looking at windows.
+    pub fn finish(&mut self) {
+        self.finish_with(|_| {});
+    }
+
+    /// The channels seen, in order of appearance.
+    pub fn channels(&self) -> &[ChannelStatistics] {
+        &self.channels
+    }
+
+    /// One channel, if anything of it was seen.
+    pub fn channel(&self, number: u8) -> Option<&ChannelStatistics> {
+        self.channels.iter().find(|channel| channel.number == number)
+    }
+
+    /// Time of the latest record, in nanoseconds as in [`TraceRecord::time_ns`]; `None` before the first.
+    pub fn last_ns(&self) -> Option<i64> {
+        (!self.channels.is_empty()).then_some(self.last_ns)
+    }
+
+    /// Everything as plain values, ready to be printed or serialised. [`Self::finish`] comes first
+    /// where the trace is over.
+    pub fn summary(&self) -> Summary {
+        Summary::of(self)
+    }
+}
+
+#[cfg(test)]
+mod tests;

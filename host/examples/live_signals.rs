@@ -1,0 +1,47 @@
+//! Shows the signals of a bus as they come: `cargo run -p cantap --example live_signals [PORT]`.
+
+mod device;
+
+use std::error::Error;
+
+use cantap::{Channel, Device};
+use cantap_signals::{Decoder, Source, dbc};
+
+const DATABASE: &str = include_str!("data/engine.dbc");
+
+/// Shows so many messages; returns the last one's signals as text.
+pub fn show(device: &Device, messages: usize) -> Result<String, Box<dyn Error>> {
+    let database = dbc::parse("engine.dbc", DATABASE.as_bytes())?;
+    let decoder = Decoder::new(vec![Source { channel: None, database }]);
+    device.listen(Channel::Can1, 500_000)?;
+    let mut shown = 0;
+    let mut values = Vec::new();
+    for record in device.records() {
+        let record = record?;
+        let Some(found) = record.frame().and_then(|frame| decoder.decode(record.channel, frame, &mut values))
+        else {
+            continue;
+        };
+        let message = decoder.message(found);
+        let signals = values.iter().map(|value| {
+            let signal = &message.signals[value.signal as usize];
+            match signal.text(value.raw) {
+                Some(text) => format!("{} {text}", signal.name),
+                None => format!("{} {} {}", signal.name, signal.number(value.raw), signal.unit),
+            }
+        });
+        let line = signals.collect::<Vec<_>>().join(", ");
+        println!("{}: {line}", message.name);
+        shown += 1;
+        if shown == messages {
+            return Ok(line);
+        }
+    }
+    Err("the device stopped".into())
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let log = concat!("bitrate=500k,log=", env!("CARGO_MANIFEST_DIR"), "/examples/data/engine.log");
+    show(&device::chosen(log)?, 40)?;
+    Ok(())
+}

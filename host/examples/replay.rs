@@ -1,0 +1,40 @@
+//! Sends a trace file at its own times, which the device keeps: `cargo run -p cantap --example replay [PORT]`.
+//! It takes part in the bus.
+
+mod device;
+
+use std::error::Error;
+use std::time::Duration;
+
+use cantap::replay::{Accuracy, Pace, Replay};
+use cantap::{Channel, Device};
+use cantap_formats::{ReadOptions, open_reader};
+
+/// The bus is given up when nothing leaves for so long.
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// Replays a file on channel 1; returns how well its times were kept.
+pub fn replay(device: &Device, file: &str) -> Result<Accuracy, Box<dyn Error>> {
+    device.join(Channel::Can1, 500_000)?;
+    let mut replay = Replay::new(device, Pace::default(), [500_000; 2])?;
+    for record in open_reader(file, &ReadOptions::default())? {
+        let record = record?;
+        if let Some(frame) = record.frame() {
+            replay.push(record.time_ns, Channel::Can1, *frame, |_| true)?;
+        }
+    }
+    if !replay.finish(|since_the_last| since_the_last < PATIENCE)? {
+        return Err("nothing leaves any more; is there another node on the bus?".into());
+    }
+    // How each frame ended; the accuracy is taken from it.
+    let ended = replay.take_ended();
+    println!("{} frames replayed", ended.len());
+    Ok(replay.accuracy())
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let device = device::chosen("load=0,bitrate=500k")?;
+    let accuracy = replay(&device, concat!(env!("CARGO_MANIFEST_DIR"), "/examples/data/engine.log"))?;
+    println!("at most {:.1} µs late, {:.1} µs early", accuracy.late_us, accuracy.early_us);
+    Ok(())
+}

@@ -1,0 +1,144 @@
+//! Vector's ASC: lines of text with times relative to a date in the head.
+//!
+//! Classical frames, error frames and the controller's state are events of the format; a loss is a status
+//! line with the details in a trailing comment. Everything else in such a file (statistics, other
+//! buses, markers) is passed over. Dates are taken as UTC.
+
+mod decode;
+mod encode;
+
+pub(crate) use decode::Decoder;
+pub(crate) use encode::Encoder;
+
+use cantap_wire::record::ErrorState;
+
+/// What a status line says of the controller.
+const STATES: [(ErrorState, &str); 4] = [
+    (ErrorState::Passive, "chip status error passive"),
+    (ErrorState::Active, "chip status error active"),
+    (ErrorState::Warning, "chip status warning limit"),
+    (ErrorState::BusOff, "chip status bus off"),
+];
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use crate::Format;
+    use cantap_trace::testing::record;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_trace_round_trips(records in prop::collection::vec(record(1000), 0..20)) {
+            prop_assert_eq!(tests::round_trip(Format::Asc, &records), records);
+        }
+    }
+
+    const HEAD: &str = "date Sam Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\n\
+                        internal events logged\n// version 9.0.0\n\
+                        Begin Triggerblock Sam Sep 30 15:06:13.191 2017\n   0.000000 Start of measurement\n";
+
+    /// The records of some lines behind an ordinary head, as a candump log, and the issues.
+    fn as_log(lines: &str) -> (String, Vec<String>) {
+        let (records, issues) = tests::read(Format::Asc, format!("{HEAD}{lines}"));
+        (tests::write(Format::Candump, &records), issues)
+    }
+
+    #[test]
+    fn vectors_own_lines_are_read() {
+        let lines = "   0.015991 CAN 1 Status:chip status error passive - TxErr: 132 RxErr: 0\n\
+                     \t2.5010 2   C8             Tx   d 8 09 08 07 06 05 04 03 02\n\
+                     2.520002 3 200 Tx r Length = 1704000 BitCount = 145 ID = 88888888x\n\
+                     2.584921 4 300 Rx r 8 Length = 1704000 BitCount = 145 ID = 88888888x\n\
+                     3.098426 1  18EBFF00x       Rx d 8 01 A0 0F A6 60 3B D1 40    Length = 273910 BitCount = 141\n\
+                     4.501000 2 ErrorFrame Flags = 0xe CodeExt = 0x20a2 Code = 0x82 ID = 0 DLC = 0 Position = 5\n\
+                     4.6 1 ErrorFrame ECC: 10100010\n\
+                     5.0 1  Statistic: D 0 R 0 XD 0 XR 0 E 0 O 0 B 0.00%\n\
+                     5.1 1 J1939TP FEE3p 6 0 0 - Rx d 23 A0 0F\n\
+                     5.2 CANFD   1 Rx        300                                   1 0 8  8 11 c2 03 04 05 06 07 08   102203  133   303000 e0006659 46500250 4b140250 20011736 2001040d\n\
+                     5.3 CANFD   2 Rx        30a  Generic_Name_12                  0 0 2  2 11 c2   102203  133   200000 e0006659 46500250 4b140250 20011736 2001040d\n\
+                     End TriggerBlock\n";
+        let (log, issues) = as_log(lines);
+        assert_eq!(
+            log,
+            "(1506783973.206991) can0 20000284#0030000000008400\n\
+             (1506783975.692000) can1 0C8#0908070605040302 T\n\
+             (1506783975.711002) can2 200#R T\n\
+             (1506783975.775921) can3 300#R8\n\
+             (1506783976.289426) can0 18EBFF00#01A00FA6603BD140\n\
+             (1506783977.692000) can1 20000088#0000040000000000\n\
+             (1506783977.791000) can0 20000088#0000040000000000\n\
+             (1506783978.491000) can1 30A#11C2\n"
+        );
+        assert_eq!(issues, ["test, line 16: a CAN FD frame cannot be represented and is left out"]);
+    }
+
+    #[test]
+    fn base_dates_and_relative_times_follow_the_head() {
+        let file = "date Sat Sep 30 10:06:13 pm 2017\nbase dec  timestamps relative\n\
+                    no internal events logged\n0.5 1 291 Rx d 2 16 255\n0.25 1 400x Tx d 0\n";
+        let (records, issues) = tests::read(Format::Asc, file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(1506809173.500000) can0 123#10FF\n(1506809173.750000) can0 00000190# T\n"
+        );
+    }
+
+    /// python-can writes the time of writing as `date`, and the trace's own at the trigger block. A trace
+    /// triggered long after its start has times from the start.
+    #[test]
+    fn the_trigger_blocks_date_counts_unless_times_run_from_the_start() {
+        let first = |block: &str, time: &str| {
+            let file = format!(
+                "date Sat Sep 30 15:00:00.000 2017\nbase hex  timestamps absolute\ninternal events logged\n\
+                 Begin Triggerblock Sat Sep {block}\n{time} 1 123 Rx d 0\n"
+            );
+            tests::write(Format::Candump, &tests::read(Format::Asc, file).0)
+        };
+        assert_eq!(first("23 15:00:00.250 2017", "0.000001"), "(1506178800.250001) can0 123#\n");
+        assert_eq!(first("30 15:10:00.000 2017", "599.5"), "(1506784199.500000) can0 123#\n");
+    }
+
+    #[test]
+    fn broken_lines_are_named() {
+        let (log, issues) = as_log(
+            "1.0 1 123 Rx d 2 11\n1.0 1 123 Rx d 40 00\n1.0 1 12345678 Rx d 0\nrubbish\n1.0 1 123 Rx\n\
+             2.0 1 123 Rx d 1 1G\n3.0 1 123 Rx d 1 55\n4.0 1 123 Rx d 8 01 02",
+        );
+        assert_eq!(log, "(1506783976.191000) can0 123#55\n");
+        assert_eq!(
+            issues,
+            [
+                "test, line 7: expected 2 data bytes, found '11'",
+                "test, line 8: expected a data length code of 0 to F, found '40'",
+                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF with x behind it, found '12345678'",
+                "test, line 10: expected a line that begins with a time in seconds, found 'rubbish'",
+                "test, line 11: expected 'd' or 'r' behind the direction, found nothing",
+                "test, line 12: expected 1 data bytes, found '1G'",
+                "test, line 14: the file ends inside a line; everything before it was read",
+            ]
+        );
+    }
+
+    #[test]
+    fn lines_are_what_other_programs_read() {
+        let (records, _) = tests::read(
+            Format::Candump,
+            "(1506783973.192991) can0 123#11.22\n(1506783974.0) can1 1F334455#R3 T\n\
+             (1506783974.5) can0 20000084#0200000000000000\n",
+        );
+        assert_eq!(
+            tests::write(Format::Asc, &records),
+            "date Sat Sep 30 15:06:13.192 2017\n\
+             base hex  timestamps absolute\n\
+             internal events logged\n\
+             Begin Triggerblock Sat Sep 30 15:06:13.192 2017\n\
+             \x20  0.000000 Start of measurement\n\
+             \x20  0.000991 1  123             Rx   d 2 11 22\n\
+             \x20  0.808000 2  1F334455x       Tx   r 3\n\
+             \x20  1.308000 1  ErrorFrame  // cantap: bus-error\n\
+             End TriggerBlock\n"
+        );
+    }
+}

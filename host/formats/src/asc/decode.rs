@@ -1,0 +1,383 @@
+//! Reading ASC.
+
+use std::io;
+
+use cantap_wire::{Frame, Id};
+
+use super::super::calendar::{Date, MONTHS};
+use super::super::codec::{Decode, REQUESTS_TO_SEND};
+use super::super::event_text;
+use super::super::found::Found;
+use super::super::input::Input;
+use super::super::issue::Fault;
+use super::super::sja1000;
+use super::super::text::{self, NS_PER_S};
+use super::STATES;
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+/// Reads ASC.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    decimal: bool,
+    relative: bool,
+    /// From the `date` line.
+    date_ns: i64,
+    /// From the first trigger block, until the first time shows which of the dates counts.
+    block_ns: Option<i64>,
+    blocks: u32,
+    /// What times are added to: a date, or with relative times the last event.
+    base_ns: Option<i64>,
+}
+
+/// What a line is.
+enum Content {
+    Record(TraceRecord),
+    /// A request to send: if it gets through, a Tx line follows.
+    Request,
+    /// Part of the file's head, or an event of no interest.
+    Other,
+}
+
+/// What a line on a classical channel is.
+enum Classical {
+    Event(TraceEvent),
+    Request,
+    Other,
+}
+
+/// Whether `line` begins with `word`, in any case.
+fn begins(line: &[u8], word: &str) -> bool {
+    line.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes()))
+}
+
+/// Whether a line is empty or the end of a block, with which files end.
+fn is_footer(line: &[u8]) -> bool {
+    line.is_empty() || begins(line, "end triggerblock")
+}
+
+impl Decode for Decoder {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        while let Some(line) = input.line()? {
+            let text = line.text.trim_ascii();
+            match self.line(text) {
+                Ok(Content::Record(record)) if !line.terminated && self.may_be_cut(text, &record) => {
+                    return Ok(line.cut());
+                }
+                Ok(Content::Record(record)) => return Ok(Found::Record(record)),
+                Ok(Content::Request) => return Ok(Found::Note(REQUESTS_TO_SEND)),
+                // The beginning of an event can look like one of no interest.
+                Ok(Content::Other) if !line.terminated && !is_footer(text) => return Ok(line.cut()),
+                Ok(Content::Other) => {}
+                Err(fault) => return Ok(line.issue(fault)),
+            }
+        }
+        Ok(Found::End)
+    }
+}
+
+impl Decoder {
+    fn line(&mut self, line: &[u8]) -> Result<Content, Fault> {
+        let (time, rest) = text::word(line);
+        match text::time(time, NS_PER_S, b'.') {
+            Some(offset_ns) => self.event(offset_ns, rest),
+            None => self.head(line).map(|()| Content::Other),
+        }
+    }
+
+    /// A line that does not begin with a time.
+    fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
+        if begins(line, "date ") {
+            self.date_ns = date(&line[5..])?;
+        } else if begins(line, "base ") {
+            let words = line.to_ascii_lowercase();
+            let has = |word| memchr::memmem::find(&words, word).is_some();
+            self.decimal = has(b"base dec");
+            self.relative = has(b"relative");
+        } else if begins(line, "begin triggerblock") {
+            // Later blocks belong to the same measurement: its times go on.
+            self.blocks += 1;
+            let stamp = line["begin triggerblock".len()..].trim_ascii();
+            if self.blocks == 1 && !stamp.is_empty() {
+                self.block_ns = Some(date(stamp)?);
+            }
+        } else if !(line.is_empty()
+            || line.starts_with(b"//")
+            || begins(line, "internal events")
+            || begins(line, "no internal events")
+            || begins(line, "end triggerblock"))
+        {
+            return Err(Fault::malformed("a line that begins with a time in seconds", line));
+        }
+        Ok(())
+    }
+
+    /// The absolute time of an event.
+    #[inline]
+    fn time(&mut self, offset_ns: i64) -> i64 {
+        let base_ns = match self.base_ns {
+            Some(base_ns) => base_ns,
+            None => self.start(offset_ns),
+        };
+        let time_ns = base_ns.saturating_add(offset_ns);
+        if self.relative {
+            self.base_ns = Some(time_ns);
+        }
+        time_ns
+    }
+
+    /// Decides between the dates of the head and of the trigger block. Vector's times run from the head's,
+    /// and the block's is about that of its first event. python-can's head tells when the file was
+    /// written, and times run from the block's.
+    fn start(&mut self, offset_ns: i64) -> i64 {
+        let base_ns = match self.block_ns {
+            None => self.date_ns,
+            Some(block_ns) => {
+                let apart_ns =
+                    self.date_ns.saturating_add(offset_ns).saturating_sub(block_ns).saturating_abs();
+                let from_head = offset_ns > NS_PER_S && apart_ns < offset_ns / 2;
+                if from_head { self.date_ns } else { block_ns }
+            }
+        };
+        self.base_ns = Some(base_ns);
+        base_ns
+    }
+
+    #[inline]
+    fn event(&mut self, offset_ns: i64, rest: &[u8]) -> Result<Content, Fault> {
+        let time_ns = self.time(offset_ns);
+        let (first, rest) = text::word(rest);
+        if let Some(channel) = channel(first) {
+            return Ok(match self.classical(rest)? {
+                Classical::Event(event) => record(time_ns, channel, event),
+                Classical::Request => Content::Request,
+                Classical::Other => Content::Other,
+            });
+        }
+        let (second, rest) = text::word(rest);
+        let Some(channel) = channel(second) else { return Ok(Content::Other) };
+        let event = match first {
+            b"CAN" => status(rest),
+            b"CANFD" => self.flexible(rest)?,
+            _ => None,
+        };
+        Ok(event.map_or(Content::Other, |event| record(time_ns, channel, event)))
+    }
+
+    /// An event on a classical channel, behind the channel's number.
+    #[inline]
+    fn classical(&self, rest: &[u8]) -> Result<Classical, Fault> {
+        let (id, rest) = text::word(rest);
+        if id.eq_ignore_ascii_case(b"ErrorFrame") {
+            return Ok(Classical::Event(error_frame(rest)));
+        }
+        let Some((raw, extended)) = self.identifier(id) else { return Ok(Classical::Other) };
+        let (word, rest) = text::word(rest);
+        let direction = match word {
+            b"Rx" => Direction::Rx,
+            b"Tx" => Direction::Tx,
+            b"TxRq" => return Ok(Classical::Request),
+            _ => return Err(Fault::malformed("'Rx' or 'Tx' behind the identifier", word)),
+        };
+        let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", id)
+        })?;
+        let (kind, rest) = text::word(rest);
+        let (dlc, rest) = text::word(rest);
+        let frame = match kind {
+            b"d" | b"D" => {
+                let dlc = self.dlc(dlc)?;
+                let len = dlc.min(8);
+                let data = self.data(rest, len)?;
+                Frame::from_bus(id, false, dlc, data)
+            }
+            b"r" | b"R" => {
+                // Older files leave the length out, and others go on with further columns.
+                let dlc = if dlc.len() == 1 { self.dlc(dlc)? } else { 0 };
+                Frame::from_bus(id, true, dlc, [0; 8])
+            }
+            other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
+        };
+        Ok(Classical::Event(TraceEvent::Frame { frame, direction, late: false }))
+    }
+
+    /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
+    /// whose bytes are all there.
+    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        match record.frame() {
+            Some(frame) if frame.is_remote() => matches!(line.last(), Some(b'r' | b'R')),
+            Some(_) => self.decimal || memchr::memmem::find(line, b"CANFD").is_some(),
+            None => true,
+        }
+    }
+
+    /// An event on a CAN FD channel, which may be a classical frame.
+    fn flexible(&self, rest: &[u8]) -> Result<Option<TraceEvent>, Fault> {
+        const REMOTE: u32 = 1 << 4;
+        const FD_FORMAT: u32 = 1 << 12;
+        let unsupported = || Fault::Unsupported("a CAN FD frame".into());
+        let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let direction = match words.next() {
+            Some(b"Rx") => Direction::Rx,
+            Some(b"Tx") => Direction::Tx,
+            _ => return Ok(None),
+        };
+        let Some(id) = words.next() else { return Ok(None) };
+        if id.eq_ignore_ascii_case(b"ErrorFrame") {
+            return Ok(Some(TraceEvent::BusError { kind: None, counters: None }));
+        }
+        let (raw, extended) = self.identifier(id).ok_or_else(unsupported)?;
+        let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(unsupported)?;
+        // An optional symbolic name, then BRS, ESI, DLC, data length, data, duration, bits, flags.
+        let mut next = words.next();
+        if !matches!(next, Some(b"0" | b"1")) {
+            next = words.next();
+        }
+        let esi = words.next();
+        let dlc = words.next().and_then(text::hex).filter(|dlc| *dlc < 16);
+        let len = words.next().and_then(text::decimal).filter(|len| *len <= 64);
+        let (Some(_), Some(_), Some(dlc), Some(len)) = (next, esi, dlc, len) else {
+            return Err(unsupported());
+        };
+        let mut data = [0; 8];
+        for at in 0..len as usize {
+            let byte = words.next().and_then(|word| self.byte(word)).ok_or_else(unsupported)?;
+            if let Some(slot) = data.get_mut(at) {
+                *slot = byte;
+            }
+        }
+        let flags = words.nth(2).and_then(text::hex).ok_or_else(unsupported)?;
+        if flags & FD_FORMAT != 0 || len > 8 {
+            return Err(unsupported());
+        }
+        let frame = Frame::from_bus(id, flags & REMOTE != 0, dlc as u8, data);
+        Ok(Some(TraceEvent::Frame { frame, direction, late: false }))
+    }
+
+    #[inline]
+    fn identifier(&self, word: &[u8]) -> Option<(u32, bool)> {
+        let (digits, extended) = match word {
+            [digits @ .., b'x' | b'X'] => (digits, true),
+            _ => (word, false),
+        };
+        let raw = if self.decimal { u32::try_from(text::decimal(digits)?).ok()? } else { text::hex(digits)? };
+        Some((raw, extended))
+    }
+
+    #[inline]
+    fn dlc(&self, word: &[u8]) -> Result<u8, Fault> {
+        let dlc = match word {
+            [digit] => text::hex_digit(*digit),
+            _ if self.decimal => text::decimal(word).filter(|dlc| *dlc < 16).map(|dlc| dlc as u8),
+            _ => None,
+        };
+        dlc.ok_or_else(|| Fault::malformed("a data length code of 0 to F", word))
+    }
+
+    #[inline]
+    fn byte(&self, word: &[u8]) -> Option<u8> {
+        if self.decimal {
+            return text::decimal(word).and_then(|byte| u8::try_from(byte).ok());
+        }
+        match word {
+            [high, low] => text::hex_pair(*high, *low),
+            _ => None,
+        }
+    }
+
+    #[inline]
+    fn data(&self, columns: &[u8], len: u8) -> Result<[u8; 8], Fault> {
+        let mut data = [0; 8];
+        let mut rest = columns;
+        for slot in &mut data[..usize::from(len)] {
+            let (word, after) = text::word(rest);
+            let fault = || Fault::malformed(format!("{len} data bytes"), columns.trim_ascii());
+            *slot = self.byte(word).ok_or_else(fault)?;
+            rest = after;
+        }
+        Ok(data)
+    }
+}
+
+fn record(time_ns: i64, channel: u8, event: TraceEvent) -> Content {
+    Content::Record(TraceRecord { time_ns, channel, event })
+}
+
+#[inline]
+fn channel(word: &[u8]) -> Option<u8> {
+    text::decimal(word).and_then(|channel| u8::try_from(channel).ok())
+}
+
+/// What stands behind `ErrorFrame`.
+fn error_frame(rest: &[u8]) -> TraceEvent {
+    if let Some(event) = event_text::marked(rest) {
+        return event;
+    }
+    let value = |name: &[u8]| {
+        let at = memchr::memmem::find(rest, name)?;
+        Some(text::word(&rest[at + name.len()..]).0)
+    };
+    let code = match (value(b"ECC:"), value(b" Code = 0x")) {
+        (Some(bits), _) => std::str::from_utf8(bits).ok().and_then(|bits| u8::from_str_radix(bits, 2).ok()),
+        (None, Some(code)) => text::hex(code).and_then(|code| u8::try_from(code).ok()),
+        (None, None) => None,
+    };
+    TraceEvent::BusError { kind: code.and_then(sja1000::kind), counters: None }
+}
+
+/// A status line, behind the channel.
+fn status(rest: &[u8]) -> Option<TraceEvent> {
+    let status = rest.trim_ascii().strip_prefix(b"Status:")?;
+    if let Some(event) = event_text::marked(status) {
+        return Some(event);
+    }
+    let status = String::from_utf8_lossy(status).to_ascii_lowercase();
+    if status.contains("overrun") {
+        return Some(TraceEvent::Lost { stage: None, count: 1, at_least: true });
+    }
+    // Files spell these in more than one way.
+    let status = status.replace("busoff", "bus off").replace("warning level", "warning limit");
+    let (state, _) = STATES.iter().find(|(_, text)| status.starts_with(text))?;
+    let counter = |name: &str| {
+        let (_, rest) = status.split_once(name)?;
+        rest.split_ascii_whitespace().next()?.parse().ok()
+    };
+    let counters = counter("txerr:").zip(counter("rxerr:"));
+    Some(TraceEvent::State { state: *state, counters })
+}
+
+/// `Sat Sep 30 15:06:13.191 2017`, also with am or pm before the year, also in German.
+fn date(text: &[u8]) -> Result<i64, Fault> {
+    let fault = || Fault::malformed("a date such as Sat Sep 30 15:06:13.191 2017", text);
+    let text_utf8 = String::from_utf8_lossy(text);
+    let words: Vec<&str> = text_utf8.split_ascii_whitespace().collect();
+    let (month, day, clock, half, year) = match words[..] {
+        [_, month, day, clock, year] => (month, day, clock, None, year),
+        [_, month, day, clock, half, year] => (month, day, clock, Some(half), year),
+        _ => return Err(fault()),
+    };
+    let month = match month {
+        "Mär" | "Mrz" => "Mar",
+        "Mai" => "May",
+        "Okt" => "Oct",
+        "Dez" => "Dec",
+        other => other,
+    };
+    let month = MONTHS.iter().position(|known| known.eq_ignore_ascii_case(month)).ok_or_else(fault)?;
+    let mut parts = clock.splitn(3, ':');
+    let mut part = || parts.next().map(str::as_bytes).ok_or_else(fault);
+    let hour = text::decimal(part()?).ok_or_else(fault)?;
+    let minute = text::decimal(part()?).ok_or_else(fault)?;
+    let second_ns = text::time(part()?, NS_PER_S, b'.').filter(|ns| *ns >= 0).ok_or_else(fault)?;
+    let hour = match half.map(str::to_ascii_lowercase).as_deref() {
+        // Twelve comes first on a clock of twelve hours. Some files write hours above twelve and pm.
+        Some("am") => hour % 12,
+        Some("pm") if hour < 12 => hour + 12,
+        None | Some("pm") => hour,
+        Some(_) => return Err(fault()),
+    };
+    let second = (second_ns / NS_PER_S) as u64;
+    let of_day_ns = Date::of_day(hour, minute, second, second_ns % NS_PER_S).ok_or_else(fault)?;
+    let year = year.parse().map_err(|_| fault())?;
+    let day = day.parse().map_err(|_| fault())?;
+    Date { year, month: month as u8 + 1, day, of_day_ns }.time_ns().ok_or_else(fault)
+}

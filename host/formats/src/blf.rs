@@ -1,0 +1,121 @@
+//! Vector's BLF: objects in compressed containers behind a header of 144 bytes.
+//!
+//! Vector publishes no description. What is known comes from Tobias Lorenz's vector_blf and from
+//! python-can; field names follow them. Written are CAN_MESSAGE, CAN_ERROR_EXT, DATA_LOST_END, and
+//! EVENT_COMMENT for what has no object of its own. A container that is on the disk can be read
+//! whatever happens afterwards: the header's totals are for information.
+
+mod decode;
+mod encode;
+
+pub(crate) use decode::Decoder;
+pub(crate) use encode::Encoder;
+
+/// First bytes of a file, and its header's length.
+pub(crate) const FILE_MAGIC: &[u8; 4] = b"LOGG";
+const FILE_HEADER_BYTES: usize = 144;
+/// Where the header has the file's length.
+const FILE_BYTES_OFFSET: usize = 16;
+/// Where the header has the time of measurement start.
+const START_OFFSET: usize = 40;
+
+const OBJECT_MAGIC: &[u8; 4] = b"LOBJ";
+/// Signature, header length, header version, object length, object type.
+const BASE_HEADER_BYTES: usize = 16;
+/// The base header with flags, client, version and time.
+const HEADER_BYTES: usize = 32;
+/// A container's own fields: compression, length when decompressed.
+const CONTAINER_FIELDS_BYTES: usize = 16;
+
+const TIME_IN_TEN_US: u32 = 1;
+const TIME_IN_NS: u32 = 2;
+
+const COMPRESSION_NONE: u16 = 0;
+const COMPRESSION_ZLIB: u16 = 2;
+
+const CAN_MESSAGE: u32 = 1;
+const CAN_ERROR: u32 = 2;
+const LOG_CONTAINER: u32 = 10;
+const CAN_ERROR_EXT: u32 = 73;
+const CAN_MESSAGE2: u32 = 86;
+const EVENT_COMMENT: u32 = 92;
+const CAN_FD_MESSAGE: u32 = 100;
+const CAN_FD_MESSAGE_64: u32 = 101;
+const CAN_FD_ERROR_64: u32 = 104;
+const DATA_LOST_END: u32 = 126;
+
+/// Bit 31 of an identifier.
+const EXTENDED: u32 = 1 << 31;
+/// A frame's flags: the low four bits are the direction (0 received, 1 sent, 2 requested to be sent).
+const DIRECTION: u8 = 0x0F;
+const SENT: u8 = 1;
+const REQUESTED: u8 = 2;
+const REMOTE: u8 = 0x80;
+
+/// In an error object: the SJA1000's error code is valid.
+const HAS_SJA1000_CODE: u32 = 1;
+/// Ours, in the data bytes of an error object whose length is 0: this mark, then the kind from 1, whether
+/// the counters are known, and the counters. Other programs look at no byte beyond the length.
+const OWN_MARK: u8 = b'c';
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use crate::{Format, WriteOptions};
+    use cantap_trace::TraceRecord;
+    use cantap_trace::testing::{data_record, record};
+    use proptest::prelude::*;
+
+    fn file(records: &[TraceRecord]) -> Vec<u8> {
+        let options = WriteOptions { format: Some(Format::Blf), ..WriteOptions::default() };
+        tests::write_with(&options, records).0
+    }
+
+    proptest! {
+        #[test]
+        fn any_trace_in_order_round_trips(mut records in prop::collection::vec(record(1), 0..20)) {
+            records.sort_by_key(|record| record.time_ns);
+            prop_assert_eq!(tests::round_trip(Format::Blf, &records), records);
+        }
+    }
+
+    #[test]
+    fn times_before_the_first_are_moved_and_counted() {
+        let records = [data_record(5_000_000_000_000_000_000), data_record(1)];
+        let options = WriteOptions { format: Some(Format::Blf), ..WriteOptions::default() };
+        let (bytes, left_out) = tests::write_with(&options, &records);
+        assert_eq!(tests::read(Format::Blf, bytes).0, [records[0], records[0]]);
+        assert_eq!(left_out.iter().map(|(_, count)| count).collect::<Vec<_>>(), [1]);
+    }
+
+    #[test]
+    fn a_cut_file_gives_everything_up_to_the_cut() {
+        let records: Vec<_> = (0..20_000).map(|at| data_record(at * 1_000_003)).collect();
+        let whole = file(&records);
+        let (read, issues) = tests::read(Format::Blf, &whole);
+        assert_eq!((read.len(), issues.len()), (20_000, 0));
+        let mut most = 0;
+        for cut in [whole.len() - 1, whole.len() / 2, whole.len() / 10, 200, 144, 100, 3] {
+            let (read, issues) = tests::read(Format::Blf, &whole[..cut]);
+            assert!(records.starts_with(&read));
+            assert!(cut == 144 || issues.len() == 1, "{cut}: {issues:?}");
+            most = most.max(read.len());
+        }
+        // The cut container gives what it has.
+        assert!(most > 19_900, "{most}");
+    }
+
+    #[test]
+    fn damage_costs_a_container_and_is_named() {
+        let records: Vec<_> = (0..20_000).map(|at| data_record(at * 1_000_003)).collect();
+        let mut bytes = file(&records);
+        let second = memchr::memmem::find_iter(&bytes, b"LOBJ").nth(1).unwrap();
+        bytes[second..second + 4].copy_from_slice(b"XXXX");
+        let (read, issues) = tests::read(Format::Blf, &bytes);
+        assert!(read.len() > 10_000 && read.len() < 20_000, "{}", read.len());
+        assert_eq!(issues.len(), 1);
+        assert!(issues[0].contains("expected an object that begins with LOBJ"), "{issues:?}");
+        bytes[..4].copy_from_slice(b"junk");
+        assert!(tests::read(Format::Blf, &bytes).1[0].contains("LOGG"));
+    }
+}

@@ -1,0 +1,78 @@
+//! The two halves of a format, which know neither files nor compression: a [`Decode`] takes bytes from an [`Input`], an
+//! [`Encode`] appends them to a buffer.
+
+use std::io;
+
+use super::found::Found;
+use super::input::Input;
+use super::left_out::LeftOut;
+use super::output::Patch;
+use cantap_trace::TraceRecord;
+
+/// Records decoded at a time: few enough to stay in the processor's cache.
+pub(crate) const BATCH: usize = 256;
+
+/// Of the rows and objects that Vector's programs write before they send a frame.
+pub(crate) const REQUESTS_TO_SEND: &str =
+    "requests to send were passed over: what was sent is in the trace again as sent";
+
+/// The reading half of a format.
+pub(crate) trait Decode: Send {
+    /// The next record or issue. Errors are those of the system.
+    fn next(&mut self, input: &mut Input) -> io::Result<Found>;
+
+    /// Whether a line that is there is enough for [`Self::next`] not to wait for more.
+    fn needs_one_line(&self) -> bool {
+        true
+    }
+
+    /// Records up to something else, which is returned; `None` if there are enough, or if more must be waited for. Here,
+    /// so that each format's [`Self::next`] becomes part of its own loop.
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+            if records.len() >= BATCH || input.may_wait() && !(self.needs_one_line() && input.has_line()) {
+                return Ok(None);
+            }
+        }
+    }
+}
+
+/// The writing half of a format: appends to a buffer, knows nothing of files.
+pub(crate) trait Encode: Send {
+    /// Appends a record, and before the first one the file's head.
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut);
+
+    /// Whether the format can say that a frame's time is only an upper bound.
+    fn carries_late(&self) -> bool {
+        false
+    }
+
+    /// Appends what was held back, so that a file ending here is valid.
+    fn flush(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
+
+    /// Bytes that [`Self::flush`] would append at most.
+    fn held_back(&self) -> usize {
+        0
+    }
+
+    /// Appends the file's end. A file without any record gets its head here.
+    fn finish(&mut self, out: &mut Vec<u8>, left_out: &mut LeftOut);
+
+    /// Appends what would make a file end here: what [`Self::finish`] would append, and what is held back for a record that
+    /// may come.
+    fn provisional_end(&self, _out: &mut Vec<u8>) {}
+
+    /// What to change in the bytes already written, after `written` bytes in all.
+    fn patch(&self, _written: u64) -> Option<Patch> {
+        None
+    }
+
+    /// How many of these bytes at the end of the file are whole records.
+    fn whole(&self, bytes: &[u8]) -> usize {
+        memchr::memrchr(b'\n', bytes).map_or(0, |end| end + 1)
+    }
+}

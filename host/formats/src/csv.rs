@@ -1,0 +1,439 @@
+//! CSV in three dialects; reading takes the dialect from the head.
+//!
+//! python-can's (`timestamp,arbitration_id,extended,remote,error,dlc,data`) has no place for channel and direction;
+//! everything that is not a frame is an error row with SocketCAN's classes and bytes. Our own is for
+//! people and spreadsheets and carries everything. The earlier CANanalyser's is in
+//! [`analyser`](super::analyser).
+
+use std::io;
+
+use cantap_wire::{Frame, Id};
+
+use super::analyser;
+use super::codec::{Decode, Encode};
+use super::error_frames::ErrorFrames;
+use super::event_text::EventText;
+use super::found::{Found, Row};
+use super::input::Input;
+use super::issue::{Fault, Place};
+use super::left_out::LeftOut;
+use super::text::{self, NS_PER_S};
+use cantap_trace::socketcan::ErrorFrame;
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+/// Which columns.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+#[non_exhaustive]
+pub enum CsvDialect {
+    /// As python-can writes and reads it.
+    PythonCan,
+    /// Ours: everything, for people and spreadsheets.
+    Full,
+    /// The earlier CANanalyser's.
+    Analyser,
+}
+
+const PYTHON_CAN_HEAD: &str = "timestamp,arbitration_id,extended,remote,error,dlc,data";
+const FULL_HEAD: &str = "time,channel,direction,type,id,dlc,data,event";
+
+/// Reads any dialect.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    dialect: Option<CsvDialect>,
+    analyser: analyser::RowDecoder,
+    /// Lines before the head that may be the analyser's comments, and what is wrong if they are not.
+    comments: u32,
+    no_head: Option<(Place, Fault)>,
+    error_frames: ErrorFrames,
+}
+
+impl Decode for Decoder {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
+        }
+        while let Some(line) = input.line()? {
+            let text = line.text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(line.text).trim_ascii();
+            if text.is_empty() {
+                continue;
+            }
+            let result = match self.dialect {
+                None => self.head(text),
+                Some(CsvDialect::PythonCan) => python_can(text, &mut self.error_frames),
+                Some(CsvDialect::Full) => full(text).map(|record| Some((record, None))),
+                Some(CsvDialect::Analyser) => self.analyser.line(text, line.terminated),
+            };
+            if !line.terminated && self.may_be_cut(text, &result) {
+                return Ok(line.cut());
+            }
+            match result {
+                Ok(Some((record, second))) => {
+                    self.error_frames.keep(second.map(|event| TraceRecord { event, ..record }));
+                    return Ok(Found::Record(record));
+                }
+                Ok(None) => {}
+                Err(fault) if self.dialect.is_none() => {
+                    // The analyser's file begins with comments; they are told from damage by the head behind them.
+                    self.comments += 1;
+                    if self.comments > MAX_COMMENTS {
+                        return Ok(line.issue(fault));
+                    }
+                    self.no_head.get_or_insert((Place::Line(line.number), fault));
+                }
+                Err(fault) => return Ok(line.issue(fault)),
+            }
+        }
+        let no_head = self.no_head.take().filter(|_| self.dialect.is_none());
+        Ok(no_head.map_or(Found::End, |(place, fault)| Found::Issue(place, fault)))
+    }
+}
+
+/// More lines than this before the head are no comments.
+const MAX_COMMENTS: u32 = 100;
+
+impl Decoder {
+    /// Whether a last row that looks whole, and has no line end, may have lost the end of what it says.
+    fn may_be_cut(&self, row: &[u8], read: &Result<Row, Fault>) -> bool {
+        let Ok(Some((TraceRecord { event, .. }, _))) = read else { return false };
+        let is_frame = matches!(event, TraceEvent::Frame { .. });
+        match self.dialect {
+            Some(CsvDialect::Full) => !is_frame || !(row.ends_with(b",") || row.ends_with(b",late")),
+            Some(CsvDialect::PythonCan) => !is_frame && !row.ends_with(b"="),
+            Some(CsvDialect::Analyser) | None => false,
+        }
+    }
+
+    fn head(&mut self, line: &[u8]) -> Result<Row, Fault> {
+        if line == PYTHON_CAN_HEAD.as_bytes() {
+            self.dialect = Some(CsvDialect::PythonCan);
+        } else if line == FULL_HEAD.as_bytes() {
+            self.dialect = Some(CsvDialect::Full);
+        } else if self.analyser.head(line) {
+            self.dialect = Some(CsvDialect::Analyser);
+        } else {
+            // Without its head a table is most likely one of python-can's columns, cut out of a file.
+            let row = python_can(line, &mut self.error_frames);
+            if row.is_ok() {
+                self.dialect = Some(CsvDialect::PythonCan);
+                return row;
+            }
+            let expected = format!("a head such as {PYTHON_CAN_HEAD}, {FULL_HEAD} or Index;TimeStamps;…");
+            return Err(Fault::malformed(expected, line));
+        }
+        Ok(None)
+    }
+}
+
+/// Splits a row into `N` columns.
+fn columns<const N: usize>(line: &[u8]) -> Result<[&[u8]; N], Fault> {
+    let mut columns: [&[u8]; N] = [b""; N];
+    let mut count = 0;
+    for column in line.split(|byte| *byte == b',') {
+        if let Some(slot) = columns.get_mut(count) {
+            *slot = column.trim_ascii();
+        }
+        count += 1;
+    }
+    if count == N { Ok(columns) } else { Err(Fault::malformed(format!("{N} columns"), line)) }
+}
+
+fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault> {
+    let [time, id, extended, remote, error, dlc, data] = columns(line)?;
+    let time_ns = python_time(time).ok_or_else(|| Fault::malformed("a time in seconds", time))?;
+    let digits = id.strip_prefix(b"0x").unwrap_or(id);
+    let raw = text::hex(digits).ok_or_else(|| Fault::malformed("an identifier such as 0x123", id))?;
+    let bytes = base64(data).ok_or_else(|| Fault::malformed("up to 64 bytes in base64", data))?;
+    let mut padded = [0; 8];
+    let present = bytes.len().min(8);
+    padded[..present].copy_from_slice(&bytes[..present]);
+    let record = |event| TraceRecord { time_ns, channel: 1, event };
+    if error == b"1" {
+        let (event, second) = error_frames.read(raw, padded);
+        return Ok(Some((record(event), second)));
+    }
+    let parsed = if extended == b"1" { Id::extended(raw) } else { Id::standard(raw) };
+    let parsed = parsed.ok_or_else(|| Fault::malformed("an identifier that fits its format", id))?;
+    let remote = remote == b"1";
+    let number = text::decimal(dlc).ok_or_else(|| Fault::malformed("a length", dlc))?;
+    if bytes.len() > 8 || number > 15 {
+        return Err(Fault::Unsupported("a CAN FD frame".into()));
+    }
+    let expected = number.min(8) as usize;
+    if !remote && present != expected {
+        return Err(Fault::malformed(format!("{expected} data bytes"), data));
+    }
+    let frame = Frame::from_bus(parsed, remote, number as u8, padded);
+    Ok(Some((record(TraceEvent::Frame { frame, direction: Direction::Rx, late: false }), None)))
+}
+
+/// A time as Python writes a float: `1.5`, and for small ones `9.7e-05`.
+fn python_time(time: &[u8]) -> Option<i64> {
+    if let Some(ns) = text::time(time, NS_PER_S, b'.') {
+        return Some(ns);
+    }
+    let seconds: f64 = std::str::from_utf8(time).ok()?.parse().ok()?;
+    let ns = (seconds * 1e9).round();
+    (ns.abs() < 9e18).then_some(ns as i64)
+}
+
+fn full(line: &[u8]) -> Result<TraceRecord, Fault> {
+    let [time, channel, direction, kind, id, dlc, data, event] = columns(line)?;
+    let time_ns =
+        text::time(time, NS_PER_S, b'.').ok_or_else(|| Fault::malformed("a time in seconds", time))?;
+    let channel = text::decimal(channel)
+        .and_then(|channel| u8::try_from(channel).ok())
+        .ok_or_else(|| Fault::malformed("a channel of 1 to 255", channel))?;
+    let event_text = std::str::from_utf8(event).unwrap_or_default();
+    if kind == b"event" {
+        let parsed = event_text.parse::<EventText>();
+        let EventText(event) =
+            parsed.map_err(|_| Fault::malformed("an event such as 'lost 5 queue'", event))?;
+        return Ok(TraceRecord { time_ns, channel, event });
+    }
+    let remote = match kind {
+        b"data" => false,
+        b"remote" => true,
+        other => return Err(Fault::malformed("a type: data, remote or event", other)),
+    };
+    let direction = match direction {
+        b"Rx" => Direction::Rx,
+        b"Tx" => Direction::Tx,
+        other => return Err(Fault::malformed("'Rx' or 'Tx'", other)),
+    };
+    let fault = || Fault::malformed("an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF", id);
+    let parsed = std::str::from_utf8(id).ok().and_then(|id| id.parse::<Id>().ok()).ok_or_else(fault)?;
+    let number = text::decimal(dlc)
+        .filter(|dlc| *dlc <= 15)
+        .ok_or_else(|| Fault::malformed("a data length code of 0 to 15", dlc))? as u8;
+    let expected = if remote { 0 } else { usize::from(number.min(8)) };
+    let mut bytes = [0; 8];
+    let pairs = data.chunks(2).map(|pair| match pair {
+        [high, low] => text::hex_pair(*high, *low),
+        _ => None,
+    });
+    let wrong = || Fault::malformed(format!("{expected} data bytes"), data);
+    if data.len() != 2 * expected {
+        return Err(wrong());
+    }
+    for (slot, byte) in bytes.iter_mut().zip(pairs) {
+        *slot = byte.ok_or_else(wrong)?;
+    }
+    let frame = Frame::from_bus(parsed, remote, number, bytes);
+    let event = TraceEvent::Frame { frame, direction, late: event == b"late" };
+    Ok(TraceRecord { time_ns, channel, event })
+}
+
+const BASE64: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
+
+fn push_base64(out: &mut Vec<u8>, bytes: &[u8]) {
+    for group in bytes.chunks(3) {
+        let [a, b, c] = [0, 1, 2].map(|at| group.get(at).copied().unwrap_or(0));
+        let bits = u32::from(a) << 16 | u32::from(b) << 8 | u32::from(c);
+        for at in 0..4 {
+            let digit = BASE64[(bits >> (18 - 6 * at) & 63) as usize];
+            out.push(if at > group.len() { b'=' } else { digit });
+        }
+    }
+}
+
+/// Up to 64 bytes.
+fn base64(text: &[u8]) -> Option<Vec<u8>> {
+    const LONGEST: usize = 88;
+    if !text.len().is_multiple_of(4) || text.len() > LONGEST {
+        return None;
+    }
+    let mut bytes = Vec::with_capacity(8);
+    for (at, group) in text.chunks(4).enumerate() {
+        let padding = group.iter().rev().take_while(|digit| **digit == b'=').count();
+        if padding > 2 || padding > 0 && 4 * (at + 1) != text.len() {
+            return None;
+        }
+        let mut bits = 0_u32;
+        for digit in &group[..4 - padding] {
+            bits = bits << 6 | BASE64.iter().position(|known| known == digit)? as u32;
+        }
+        bits <<= 6 * padding;
+        bytes.extend_from_slice(&bits.to_be_bytes()[1..4 - padding]);
+    }
+    Some(bytes)
+}
+
+/// Microseconds, and nanoseconds only where there are any.
+fn push_time(out: &mut Vec<u8>, time_ns: i64) {
+    text::push_time(out, time_ns, NS_PER_S, if time_ns % 1000 == 0 { 6 } else { 9 }, b'.');
+}
+
+/// Writes python-can's dialect.
+#[derive(Default)]
+pub(crate) struct PythonCanEncoder {
+    started: bool,
+}
+
+impl PythonCanEncoder {
+    fn start(&mut self, out: &mut Vec<u8>) {
+        if !std::mem::replace(&mut self.started, true) {
+            out.extend_from_slice(PYTHON_CAN_HEAD.as_bytes());
+            out.push(b'\n');
+        }
+    }
+}
+
+impl Encode for PythonCanEncoder {
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
+        self.start(out);
+        if record.channel != 1 {
+            left_out.note("channels other than 1, which python-can's CSV has no column for");
+        }
+        push_time(out, record.time_ns);
+        let mut row = |id: u32, flags: [bool; 3], dlc: u8, data: &[u8]| {
+            out.extend_from_slice(b",0x");
+            text::push_hex(out, id, text::hex_len(id));
+            for flag in flags {
+                out.extend_from_slice(if flag { b",1" } else { b",0" });
+            }
+            out.push(b',');
+            text::push_decimal(out, u64::from(dlc));
+            out.push(b',');
+            push_base64(out, data);
+            out.push(b'\n');
+        };
+        match &record.event {
+            TraceEvent::Frame { frame, direction, .. } => {
+                let id = frame.id();
+                row(id.raw(), [id.is_extended(), frame.is_remote(), false], frame.dlc(), frame.data());
+                if *direction == Direction::Tx {
+                    left_out.note("the direction of sent frames, which python-can's CSV has no column for");
+                }
+            }
+            event => {
+                if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
+                    row(classes, [true, false, true], 8, &data);
+                }
+            }
+        }
+    }
+
+    fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        self.start(out);
+    }
+}
+
+/// Writes our own dialect.
+#[derive(Default)]
+pub(crate) struct FullEncoder {
+    started: bool,
+}
+
+impl FullEncoder {
+    fn start(&mut self, out: &mut Vec<u8>) {
+        if !std::mem::replace(&mut self.started, true) {
+            out.extend_from_slice(FULL_HEAD.as_bytes());
+            out.push(b'\n');
+        }
+    }
+}
+
+impl Encode for FullEncoder {
+    fn carries_late(&self) -> bool {
+        true
+    }
+
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        self.start(out);
+        push_time(out, record.time_ns);
+        out.push(b',');
+        text::push_decimal(out, u64::from(record.channel));
+        match &record.event {
+            TraceEvent::Frame { frame, direction, late } => {
+                out.extend_from_slice(if *direction == Direction::Tx { b",Tx," } else { b",Rx," });
+                out.extend_from_slice(if frame.is_remote() { b"remote," } else { b"data," });
+                let id = frame.id();
+                text::push_hex(out, id.raw(), if id.is_extended() { 8 } else { 3 });
+                out.push(b',');
+                text::push_decimal(out, u64::from(frame.dlc()));
+                out.push(b',');
+                for byte in frame.data() {
+                    text::push_hex_byte(out, *byte);
+                }
+                out.extend_from_slice(if *late { b",late\n" } else { b",\n" });
+            }
+            event => out.extend_from_slice(format!(",,event,,,,{}\n", EventText(*event)).as_bytes()),
+        }
+    }
+
+    fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        self.start(out);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use super::*;
+    use crate::{Format, WriteOptions};
+    use cantap_trace::testing::record;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn any_trace_round_trips(records in prop::collection::vec(record(1), 0..20), late: bool) {
+            let mut records = records;
+            if let Some(TraceRecord { event: TraceEvent::Frame { late: flag, .. }, .. }) = records.first_mut() {
+                *flag = late;
+            }
+            prop_assert_eq!(tests::round_trip(Format::Csv(CsvDialect::Full), &records), records.clone());
+            let options =
+                WriteOptions { format: Some(Format::Csv(CsvDialect::PythonCan)), ..WriteOptions::default() };
+            let (bytes, left_out) = tests::write_with(&options, &records);
+            let plain = |record: &TraceRecord| {
+                let mut event = record.event;
+                if let TraceEvent::Frame { direction, late, .. } = &mut event {
+                    (*direction, *late) = (Direction::Rx, false);
+                }
+                TraceRecord { channel: 1, event, ..*record }
+            };
+            let expected: Vec<_> = records.iter().map(plain).collect();
+            let (read, issues) = tests::read(Format::Csv(CsvDialect::Full), bytes);
+            prop_assert_eq!(issues, Vec::<String>::new());
+            prop_assert_eq!(read, expected.clone());
+            let told = records.iter().zip(&expected).filter(|(record, plain)| record.channel != plain.channel);
+            let noted = left_out.iter().filter(|(what, _)| what.contains("channels")).map(|(_, count)| count);
+            prop_assert_eq!(noted.sum::<u64>(), told.count() as u64);
+        }
+
+        #[test]
+        fn base64_round_trips(bytes in prop::collection::vec(any::<u8>(), 0..=64)) {
+            let mut text = Vec::new();
+            push_base64(&mut text, &bytes);
+            prop_assert_eq!(base64(&text), Some(bytes));
+        }
+    }
+
+    #[test]
+    fn rows_are_python_cans() {
+        let file = "timestamp,arbitration_id,extended,remote,error,dlc,data\n\
+                    1483389946.197000,0xdadada,1,0,0,6,WzQyLCA5XQ==\n";
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), file);
+        // python-can's own example has a length of 6 and 7 bytes.
+        assert_eq!((records.len(), issues.len()), (0, 1));
+        let file = file.replace(",6,", ",7,").replace("0xdadada", "0xDADADA");
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), &file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(tests::write(Format::Csv(CsvDialect::PythonCan), &records), file);
+        assert_eq!(
+            tests::write(Format::Csv(CsvDialect::Full), &records),
+            "time,channel,direction,type,id,dlc,data,event\n\
+             1483389946.197000,1,Rx,data,00DADADA,7,5B34322C20395D,\n"
+        );
+    }
+
+    #[test]
+    fn broken_rows_are_named() {
+        let file = "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.0,0x1,0,0,0,1\n\
+                    x,0x1,0,0,0,0,\n1.0,zz,0,0,0,0,\n1.0,0x800,0,0,0,0,\n1.0,0x1,0,0,0,1,?\n9.7e-05,0x1,0,1,0,3,\n";
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), file);
+        assert_eq!(tests::write(Format::Candump, &records), "(0.000097) can0 001#R3\n");
+        assert_eq!(issues.len(), 5, "{issues:?}");
+        assert_eq!(issues[0], "test, line 2: expected 7 columns, found '1.0,0x1,0,0,0,1'");
+    }
+}

@@ -1,0 +1,179 @@
+//! Events in words, for the formats that let a comment stand where they have no form of their own:
+//! `lost 5+ queue`, `bus-error stuff tec=8 rec=0`, `state passive`, `errors-suppressed 17`,
+//! `transmit-failed aborted tag=3`, `transmit-failed overtaken tag=4294901760 periods=12`.
+
+use std::fmt;
+use std::str::FromStr;
+
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+
+use cantap_trace::TraceEvent;
+
+/// Marks such a text in a comment.
+pub(crate) const MARK: &str = "cantap: ";
+
+const STAGES: [(LossStage, &str); 4] = [
+    (LossStage::Controller, "controller"),
+    (LossStage::Queue, "queue"),
+    (LossStage::Link, "link"),
+    (LossStage::Host, "host"),
+];
+const KINDS: [(BusErrorKind, &str); 6] = [
+    (BusErrorKind::Stuff, "stuff"),
+    (BusErrorKind::Form, "form"),
+    (BusErrorKind::Acknowledgment, "acknowledgment"),
+    (BusErrorKind::BitRecessive, "bit-recessive"),
+    (BusErrorKind::BitDominant, "bit-dominant"),
+    (BusErrorKind::Crc, "crc"),
+];
+const STATES: [(ErrorState, &str); 4] = [
+    (ErrorState::Active, "active"),
+    (ErrorState::Warning, "warning"),
+    (ErrorState::Passive, "passive"),
+    (ErrorState::BusOff, "bus-off"),
+];
+const FAILURES: [(TransmitFailure, &str); 5] = [
+    (TransmitFailure::ArbitrationLost, "arbitration-lost"),
+    (TransmitFailure::BusError, "bus-error"),
+    (TransmitFailure::Aborted, "aborted"),
+    (TransmitFailure::Closed, "closed"),
+    (TransmitFailure::BusOff, "bus-off"),
+];
+/// The one reason that has a number.
+const OVERTAKEN: &str = "overtaken";
+
+fn name<T: PartialEq>(names: &[(T, &'static str)], item: &T) -> &'static str {
+    names.iter().find(|(known, _)| known == item).map_or("", |(_, name)| *name)
+}
+
+fn item<T: Copy>(names: &[(T, &str)], name: &str) -> Option<T> {
+    names.iter().find(|(_, known)| *known == name).map(|(item, _)| *item)
+}
+
+/// An event other than a frame, in words. A frame has none and shows as nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct EventText(pub TraceEvent);
+
+impl fmt::Display for EventText {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.0 {
+            TraceEvent::Frame { .. } => return Ok(()),
+            TraceEvent::Lost { stage, count, at_least } => {
+                write!(f, "lost {count}{}", if *at_least { "+" } else { "" })?;
+                if let Some(stage) = stage {
+                    write!(f, " {}", name(&STAGES, stage))?;
+                }
+            }
+            TraceEvent::BusError { kind, .. } => {
+                f.write_str("bus-error")?;
+                if let Some(kind) = kind {
+                    write!(f, " {}", name(&KINDS, kind))?;
+                }
+            }
+            TraceEvent::ErrorsSuppressed { count } => write!(f, "errors-suppressed {count}")?,
+            TraceEvent::State { state, .. } => write!(f, "state {}", name(&STATES, state))?,
+            TraceEvent::TransmitFailed { tag, reason } => match reason {
+                TransmitFailure::Overtaken { periods } => {
+                    write!(f, "transmit-failed {OVERTAKEN} tag={tag} periods={periods}")?;
+                }
+                _ => write!(f, "transmit-failed {} tag={tag}", name(&FAILURES, reason))?,
+            },
+        }
+        if let TraceEvent::BusError { counters: Some((tec, rec)), .. }
+        | TraceEvent::State { counters: Some((tec, rec)), .. } = &self.0
+        {
+            write!(f, " tec={tec} rec={rec}")?;
+        }
+        Ok(())
+    }
+}
+
+/// Not an event's text.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct NoEvent;
+
+impl FromStr for EventText {
+    type Err = NoEvent;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        parse(text).map(EventText).ok_or(NoEvent)
+    }
+}
+
+fn parse(text: &str) -> Option<TraceEvent> {
+    let mut words = text.split_ascii_whitespace();
+    let what = words.next()?;
+    let (mut plain, mut tag, mut periods, mut tec, mut rec) = ([None; 2], None, None, None, None);
+    for word in words {
+        match word.split_once('=') {
+            Some(("tag", value)) => tag = Some(value.parse().ok()?),
+            Some(("periods", value)) => periods = Some(value.parse().ok()?),
+            Some(("tec", value)) => tec = Some(value.parse().ok()?),
+            Some(("rec", value)) => rec = Some(value.parse().ok()?),
+            Some(_) => return None,
+            None => *plain.iter_mut().find(|slot| slot.is_none())? = Some(word),
+        }
+    }
+    let counters = tec.zip(rec);
+    Some(match (what, plain) {
+        ("lost", [Some(count), stage]) => {
+            let (count, at_least) = match count.strip_suffix('+') {
+                Some(count) => (count, true),
+                None => (count, false),
+            };
+            let stage = match stage {
+                Some(stage) => Some(item(&STAGES, stage)?),
+                None => None,
+            };
+            TraceEvent::Lost { stage, count: count.parse().ok()?, at_least }
+        }
+        ("bus-error", [None, None]) => TraceEvent::BusError { kind: None, counters },
+        ("bus-error", [Some(kind), None]) => {
+            TraceEvent::BusError { kind: Some(item(&KINDS, kind)?), counters }
+        }
+        ("errors-suppressed", [Some(count), None]) => {
+            TraceEvent::ErrorsSuppressed { count: count.parse().ok()? }
+        }
+        ("state", [Some(state), None]) => TraceEvent::State { state: item(&STATES, state)?, counters },
+        ("transmit-failed", [Some(OVERTAKEN), None]) => {
+            TraceEvent::TransmitFailed { tag: tag?, reason: TransmitFailure::Overtaken { periods: periods? } }
+        }
+        ("transmit-failed", [Some(reason), None]) => {
+            TraceEvent::TransmitFailed { tag: tag?, reason: item(&FAILURES, reason)? }
+        }
+        _ => return None,
+    })
+}
+
+/// The event in a text that contains [`MARK`].
+pub(crate) fn marked(text: &[u8]) -> Option<TraceEvent> {
+    let at = memchr::memmem::find(text, MARK.as_bytes())?;
+    parse(std::str::from_utf8(&text[at + MARK.len()..]).ok()?)
+}
+
+/// Appends an event's text with [`MARK`] in front.
+pub(crate) fn push_marked(out: &mut Vec<u8>, event: &TraceEvent) {
+    out.extend_from_slice(format!("{MARK}{}", EventText(*event)).as_bytes());
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap_trace::testing::event;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn every_event_round_trips(event in event()) {
+            let text = EventText(event).to_string();
+            prop_assert_eq!(text.parse(), Ok(EventText(event)), "{}", text);
+        }
+
+        #[test]
+        fn any_text_is_an_event_or_not(text: String) {
+            if let Some(event) = parse(&text) {
+                prop_assert_eq!(parse(&EventText(event).to_string()), Some(event));
+            }
+        }
+    }
+}

@@ -1,0 +1,132 @@
+//! One file being written, in whichever format.
+
+use std::io;
+use std::path::Path;
+
+use super::analyser::{CsvLayout, TableEncoder};
+use super::codec::Encode;
+use super::csv::CsvDialect;
+use super::dif::DifLayout;
+use super::left_out::LeftOut;
+use super::output::Output;
+use super::writer::{TraceWriter, WriteOptions};
+use super::{Format, asc, blf, candump, csv, pcapng, trc};
+use cantap_trace::{TraceEvent, TraceRecord};
+
+/// Bytes collected before they go to the system.
+const BUFFER_BYTES: usize = 128 * 1024;
+
+/// The writer of one file.
+pub(crate) struct FileWriter {
+    encoder: Box<dyn Encode>,
+    output: Output,
+    buffer: Vec<u8>,
+    /// Bytes made so far, before compression, without the buffer.
+    written: u64,
+    has_records: bool,
+    /// Size of the file when last looked at.
+    size: u64,
+    left_out: LeftOut,
+}
+
+/// The format that a path and the options ask for.
+fn format_of(path: &Path, options: &WriteOptions) -> io::Result<Format> {
+    match options.format {
+        Some(format) => Ok(format),
+        None if path.as_os_str() == "-" => Ok(Format::Candump),
+        None => Format::of_path(path).map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error)),
+    }
+}
+
+impl FileWriter {
+    pub(crate) fn create(path: &Path, options: &WriteOptions) -> io::Result<Self> {
+        let format = format_of(path, options)?;
+        Ok(Self::new(Output::create(path)?, format, options))
+    }
+
+    pub(crate) fn new(output: Output, format: Format, options: &WriteOptions) -> Self {
+        let encoder: Box<dyn Encode> = match format {
+            Format::Candump => Box::new(candump::Encoder::default()),
+            Format::Asc => Box::new(asc::Encoder::default()),
+            Format::Blf => Box::new(blf::Encoder::default()),
+            Format::Trc(version) => Box::new(trc::Encoder::new(version)),
+            Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
+            Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
+            Format::Csv(CsvDialect::Analyser) => Box::new(TableEncoder::new(CsvLayout(options.table))),
+            Format::Pcapng => Box::new(pcapng::Encoder::default()),
+            Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table))),
+        };
+        let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
+        Self {
+            encoder,
+            output,
+            buffer,
+            written: 0,
+            has_records: false,
+            size: 0,
+            left_out: LeftOut::default(),
+        }
+    }
+
+    /// Bytes the file has, with what is still held back.
+    pub(crate) fn size(&self) -> u64 {
+        self.size + (self.buffer.len() + self.encoder.held_back()) as u64
+    }
+
+    /// Whether any record was written.
+    pub(crate) fn has_records(&self) -> bool {
+        self.has_records
+    }
+
+    /// Hands the buffer on, and makes the file one that may end there.
+    fn drain(&mut self) -> io::Result<()> {
+        let encoder = &self.encoder;
+        let result = self.output.write(&self.buffer, |bytes| encoder.whole(bytes));
+        self.written += self.buffer.len() as u64;
+        self.buffer.clear();
+        self.size = self.output.size().unwrap_or(self.written);
+        result?;
+        self.patch()?;
+        self.encoder.provisional_end(&mut self.buffer);
+        let result = self.output.provisional_end(&self.buffer);
+        self.buffer.clear();
+        result
+    }
+
+    /// Brings the head up to date; returns what other programs miss in it where that cannot be done.
+    fn patch(&mut self) -> io::Result<Option<&'static str>> {
+        let Some(patch) = self.encoder.patch(self.written) else { return Ok(None) };
+        let patched = self.output.patch(&patch)?;
+        Ok(patch.missed.filter(|_| !patched))
+    }
+}
+
+impl TraceWriter for FileWriter {
+    #[inline]
+    fn write(&mut self, record: &TraceRecord) -> io::Result<()> {
+        self.has_records = true;
+        if matches!(record.event, TraceEvent::Frame { late: true, .. }) && !self.encoder.carries_late() {
+            self.left_out.note("the mark of times that are only upper bounds");
+        }
+        self.encoder.record(record, &mut self.buffer, &mut self.left_out);
+        if self.buffer.len() >= BUFFER_BYTES { self.drain() } else { Ok(()) }
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.encoder.flush(&mut self.buffer, &mut self.left_out);
+        self.drain()?;
+        self.output.flush()
+    }
+
+    fn finish(mut self: Box<Self>) -> io::Result<LeftOut> {
+        self.encoder.finish(&mut self.buffer, &mut self.left_out);
+        let result = self.output.write(&self.buffer, |bytes| self.encoder.whole(bytes));
+        self.written += self.buffer.len() as u64;
+        result?;
+        if let Some(what) = self.patch()? {
+            self.left_out.note(what);
+        }
+        self.output.finish()?;
+        Ok(self.left_out)
+    }
+}

@@ -1,0 +1,325 @@
+//! Where a reader's bytes come from: a file or standard input, plain or compressed, finished or
+//! still growing. One buffer of bounded size; lines are slices of it.
+
+use std::fs::File;
+use std::io::{self, Read};
+use std::path::Path;
+use std::time::Duration;
+
+use super::found::Found;
+use super::issue::{Fault, Place};
+
+/// Bytes asked of the system at a time.
+const CHUNK_BYTES: usize = 256 * 1024;
+
+/// Longest line or object held at once. Far above anything a trace contains, and small enough for
+/// the memory of a small machine.
+pub(crate) const MAX_ITEM_BYTES: usize = 8 * 1024 * 1024;
+
+/// How long to wait before looking again at a file that is being followed. Short against what an
+/// eye notices, long against the cost of the look.
+const FOLLOW_INTERVAL: Duration = Duration::from_millis(50);
+
+/// A buffered source of bytes.
+pub(crate) struct Input {
+    source: Box<dyn Read + Send>,
+    /// Bytes read; those before `start` are used up.
+    buffer: Vec<u8>,
+    start: usize,
+    end: usize,
+    /// Offset of `start` in the (decompressed) file.
+    offset: u64,
+    /// Lines handed out so far.
+    lines: u64,
+    follow: bool,
+    /// Whether its bytes may come slowly: a pipe, a terminal, a file that is followed.
+    may_wait: bool,
+    ended: bool,
+    cut: bool,
+    stop: Box<dyn Fn() -> bool + Send>,
+}
+
+/// One line, without its end.
+#[derive(Clone, Copy)]
+pub(crate) struct Line<'a> {
+    /// Its text.
+    pub text: &'a [u8],
+    /// Its number, from 1.
+    pub number: u64,
+    /// Whether a line end follows: false only for the last line of a file.
+    pub terminated: bool,
+    /// Whether the text is only the beginning of a line too long to hold.
+    pub too_long: bool,
+}
+
+impl Line<'_> {
+    /// What is wrong with this line. The last line of a file that was cut off is no broken one.
+    pub(crate) fn issue(&self, fault: Fault) -> Found {
+        let fault = match fault {
+            Fault::Malformed { .. } if !self.terminated && !self.too_long => Fault::Truncated("a line"),
+            fault => fault,
+        };
+        Found::Issue(Place::Line(self.number), fault)
+    }
+
+    /// For the last line of a file, if it looks whole and yet may have lost its end.
+    pub(crate) fn cut(&self) -> Found {
+        Found::Issue(Place::Line(self.number), Fault::Truncated("a line"))
+    }
+}
+
+impl Input {
+    /// Reads from any source. With `follow`, its end only means "not yet".
+    pub(crate) fn new(source: Box<dyn Read + Send>, follow: bool) -> Self {
+        Self {
+            source,
+            buffer: Vec::new(),
+            start: 0,
+            end: 0,
+            offset: 0,
+            lines: 0,
+            follow,
+            may_wait: true,
+            ended: false,
+            cut: false,
+            stop: Box::new(|| false),
+        }
+    }
+
+    /// Opens a file, or standard input for `-`; recognises gzip and zstd by their first bytes.
+    pub(crate) fn open(path: &Path, follow: bool) -> io::Result<Self> {
+        if path.as_os_str() == "-" {
+            // The end of a pipe is final.
+            return Self::decompressing(Box::new(io::stdin()), false);
+        }
+        // Opening a directory succeeds on Unix, and only reading it fails.
+        if path.is_dir() {
+            return Err(io::Error::new(io::ErrorKind::IsADirectory, "it is a directory"));
+        }
+        let file = File::open(path)?;
+        let is_file = file.metadata()?.is_file();
+        let mut input = Self::decompressing(Box::new(file), follow)?;
+        input.may_wait = follow || !is_file;
+        Ok(input)
+    }
+
+    /// Reads from a source that may be compressed.
+    pub(crate) fn decompressing(source: Box<dyn Read + Send>, follow: bool) -> io::Result<Self> {
+        let mut input = Self::new(source, follow);
+        let head = input.peek(4)?;
+        if head.starts_with(&[0x1F, 0x8B]) {
+            let decoder = flate2::read::MultiGzDecoder::new(input.into_rest());
+            return Self::new(Box::new(decoder), false).without_byte_order_mark();
+        }
+        if head.starts_with(&[0x28, 0xB5, 0x2F, 0xFD]) {
+            let decoder = zstd::stream::read::Decoder::new(input.into_rest())?;
+            return Self::new(Box::new(decoder), false).without_byte_order_mark();
+        }
+        input.without_byte_order_mark()
+    }
+
+    /// Passes over UTF-8's byte order mark, which some editors put in front of a text.
+    fn without_byte_order_mark(mut self) -> io::Result<Self> {
+        const MARK: &[u8] = &[0xEF, 0xBB, 0xBF];
+        if self.peek(MARK.len())?.starts_with(MARK) {
+            self.consume(MARK.len());
+        }
+        Ok(self)
+    }
+
+    /// What was buffered and all that follows, as a reader.
+    fn into_rest(self) -> impl Read + Send {
+        let buffered = self.buffer[self.start..self.end].to_vec();
+        io::Cursor::new(buffered).chain(self.source)
+    }
+
+    /// Ends the input as soon as this is true.
+    pub(crate) fn end_when(&mut self, stop: Box<dyn Fn() -> bool + Send>) {
+        self.stop = stop;
+    }
+
+    /// Whether its bytes may come slowly.
+    #[inline]
+    pub(crate) fn may_wait(&self) -> bool {
+        self.may_wait
+    }
+
+    /// Whether a whole line has been read and is not used up.
+    pub(crate) fn has_line(&self) -> bool {
+        memchr::memchr(b'\n', &self.buffer[self.start..self.end]).is_some()
+    }
+
+    /// Whether compressed data ended before its own end mark.
+    pub(crate) fn compressed_data_cut(&self) -> bool {
+        self.cut
+    }
+
+    /// Offset of the next byte in the decompressed file.
+    pub(crate) fn offset(&self) -> u64 {
+        self.offset
+    }
+
+    /// Number of the line handed out last.
+    pub(crate) fn line_number(&self) -> u64 {
+        self.lines
+    }
+
+    /// Reads more, keeping what is not used up. False at the end.
+    fn fill(&mut self) -> io::Result<bool> {
+        if self.ended {
+            return Ok(false);
+        }
+        if self.start > 0 {
+            self.buffer.copy_within(self.start..self.end, 0);
+            self.end -= self.start;
+            self.start = 0;
+        }
+        if self.buffer.len() < self.end + CHUNK_BYTES {
+            self.buffer.resize(self.end + CHUNK_BYTES, 0);
+        }
+        // A source that never ends is left when asked; what it gave is still read.
+        if (self.stop)() {
+            self.ended = true;
+            return Ok(false);
+        }
+        loop {
+            match self.source.read(&mut self.buffer[self.end..]) {
+                Ok(0) if self.follow && !(self.stop)() => std::thread::sleep(FOLLOW_INTERVAL),
+                Ok(0) => {
+                    self.ended = true;
+                    return Ok(false);
+                }
+                Ok(read) => {
+                    self.end += read;
+                    return Ok(true);
+                }
+                Err(error) if error.kind() == io::ErrorKind::Interrupted => {}
+                // A compressed file that was cut off ends where it ends.
+                Err(error) if error.kind() == io::ErrorKind::UnexpectedEof => {
+                    self.ended = true;
+                    self.cut = true;
+                    return Ok(false);
+                }
+                Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// At least `len` bytes (at most [`MAX_ITEM_BYTES`]) without using them up; fewer only at the end.
+    /// All that is buffered is returned.
+    #[inline]
+    pub(crate) fn peek(&mut self, len: usize) -> io::Result<&[u8]> {
+        while self.end - self.start < len.min(MAX_ITEM_BYTES) && self.fill()? {}
+        Ok(&self.buffer[self.start..self.end])
+    }
+
+    /// Uses up `len` bytes that [`Self::peek`] showed.
+    #[inline]
+    pub(crate) fn consume(&mut self, len: usize) {
+        let len = len.min(self.end - self.start);
+        self.start += len;
+        self.offset += len as u64;
+    }
+
+    /// All that is buffered and not used up.
+    #[inline]
+    pub(crate) fn buffered(&self) -> &[u8] {
+        &self.buffer[self.start..self.end]
+    }
+
+    /// Uses up so many lines that [`Self::buffered`] showed, `len` bytes in all.
+    pub(crate) fn consume_lines(&mut self, len: usize, lines: u64) {
+        self.consume(len);
+        self.lines += lines;
+    }
+
+    /// The next line; `None` at the end.
+    #[inline]
+    pub(crate) fn line(&mut self) -> io::Result<Option<Line<'_>>> {
+        let mut searched = 0;
+        let (len, terminated, too_long) = loop {
+            let unsearched = &self.buffer[self.start + searched..self.end];
+            if let Some(at) = memchr::memchr(b'\n', unsearched) {
+                break (searched + at, true, false);
+            }
+            searched = self.end - self.start;
+            if searched >= MAX_ITEM_BYTES {
+                break (searched, false, true);
+            }
+            if !self.fill()? {
+                break (searched, false, false);
+            }
+        };
+        if len == 0 && !terminated {
+            return Ok(None);
+        }
+        let at = self.start;
+        self.consume(len + usize::from(terminated));
+        self.lines += u64::from(terminated || !too_long);
+        let mut text = &self.buffer[at..at + len];
+        if let [rest @ .., b'\r'] = text {
+            text = rest;
+        }
+        // The rest of a line too long comes as further items, which no format accepts either.
+        Ok(Some(Line { text, number: self.lines, terminated, too_long }))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    fn input(bytes: impl Into<Vec<u8>>) -> Input {
+        Input::decompressing(Box::new(io::Cursor::new(bytes.into())), false).unwrap()
+    }
+
+    fn lines(mut input: Input) -> Vec<(u64, String, bool)> {
+        let mut lines = Vec::new();
+        while let Some(line) = input.line().unwrap() {
+            lines.push((line.number, String::from_utf8_lossy(line.text).into_owned(), line.terminated));
+        }
+        lines
+    }
+
+    #[test]
+    fn lines_end_in_lf_or_crlf_and_the_last_may_end_in_neither() {
+        let expected =
+            [(1, "a".into(), true), (2, String::new(), true), (3, "b".into(), true), (4, "c".into(), false)];
+        assert_eq!(lines(input("a\n\r\nb\r\nc")), expected);
+        assert_eq!(lines(input("")), []);
+    }
+
+    #[test]
+    fn a_byte_order_mark_is_no_part_of_the_first_line() {
+        let text = "\u{feff}a\nb\n";
+        let zstd = zstd::stream::encode_all(text.as_bytes(), 1).unwrap();
+        for bytes in [text.as_bytes().to_vec(), zstd] {
+            assert_eq!(lines(input(bytes)), [(1, "a".into(), true), (2, "b".into(), true)]);
+        }
+    }
+
+    #[test]
+    fn compressed_files_are_recognised_and_give_all_they_can_when_cut() {
+        let text = "0123456789\n".repeat(50_000);
+        let mut gzip = flate2::write::GzEncoder::new(Vec::new(), flate2::Compression::fast());
+        gzip.write_all(text.as_bytes()).unwrap();
+        let gzip = gzip.finish().unwrap();
+        let zstd = zstd::stream::encode_all(text.as_bytes(), 1).unwrap();
+        for whole in [gzip, zstd] {
+            assert_eq!(lines(input(whole.clone())).len(), 50_000);
+            let cut = lines(input(&whole[..whole.len() - 20]));
+            assert!(cut.len() <= 50_000);
+        }
+    }
+
+    #[test]
+    fn a_line_without_end_does_not_take_all_memory() {
+        let endless = io::repeat(b'x').take(3 * MAX_ITEM_BYTES as u64);
+        let mut input = Input::new(Box::new(endless), false);
+        let first = input.line().unwrap().unwrap();
+        assert!(first.too_long && first.text.len() <= MAX_ITEM_BYTES + CHUNK_BYTES);
+        while input.line().unwrap().is_some() {}
+        assert!(input.buffer.len() <= MAX_ITEM_BYTES + 2 * CHUNK_BYTES);
+    }
+}

@@ -1,0 +1,36 @@
+//! What a file could not carry, counted by kind.
+
+use std::collections::BTreeMap;
+
+/// What a file could not carry, or what there is to know about one: a description and how often.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct LeftOut(BTreeMap<&'static str, u64>);
+
+impl LeftOut {
+    /// Counts one more of something.
+    pub(crate) fn note(&mut self, what: &'static str) {
+        self.add(what, 1);
+    }
+
+    /// Counts `count` more of something.
+    pub(crate) fn add(&mut self, what: &'static str, count: u64) {
+        *self.0.entry(what).or_default() += count;
+    }
+
+    /// Adds another file's.
+    pub(crate) fn merge(&mut self, other: &Self) {
+        for (what, count) in &other.0 {
+            self.add(what, *count);
+        }
+    }
+
+    /// Whether everything was written.
+    pub fn is_empty(&self) -> bool {
+        self.0.is_empty()
+    }
+
+    /// Descriptions and counts.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> {
+        self.0.iter().map(|(what, count)| (*what, *count))
+    }
+}

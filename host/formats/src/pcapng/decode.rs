@@ -1,0 +1,359 @@
+//! Reading pcapng.
+
+use std::io;
+
+use cantap_wire::{Frame, Id};
+
+use super::super::codec::Decode;
+use super::super::error_frames::ErrorFrames;
+use super::super::found::Found;
+use super::super::input::{Input, MAX_ITEM_BYTES};
+use super::super::interfaces::Interfaces;
+use super::super::issue::{Fault, Place};
+use super::super::text::NS_PER_S;
+use super::{
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED,
+    IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OBSOLETE_PACKET, OUTBOUND, REMOTE,
+    SECTION_HEADER, SIMPLE_PACKET,
+};
+use cantap_trace::socketcan::ERROR_FLAG;
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+/// Longest block of a trace; far above what a CAN packet takes.
+const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
+/// Interfaces beyond this number are damage, not channels.
+const MAX_INTERFACES: usize = 4096;
+
+/// Reads pcapng.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    big_endian: bool,
+    started: bool,
+    interfaces: Vec<Interface>,
+    names: Interfaces,
+    error_frames: ErrorFrames,
+}
+
+/// What an interface description says.
+#[derive(Clone, Copy)]
+struct Interface {
+    link_type: u16,
+    channel: u8,
+    /// Units per second.
+    resolution: u64,
+    offset_s: i64,
+}
+
+/// A block's fields in its byte order.
+#[derive(Clone, Copy)]
+struct Fields<'a> {
+    bytes: &'a [u8],
+    big_endian: bool,
+}
+
+impl<'a> Fields<'a> {
+    fn array<const N: usize>(self, at: usize) -> Option<[u8; N]> {
+        self.bytes.get(at..)?.first_chunk().copied()
+    }
+
+    #[inline]
+    fn u16(self, at: usize) -> Option<u16> {
+        let bytes = self.array(at)?;
+        Some(if self.big_endian { u16::from_be_bytes(bytes) } else { u16::from_le_bytes(bytes) })
+    }
+
+    #[inline]
+    fn u32(self, at: usize) -> Option<u32> {
+        let bytes = self.array(at)?;
+        Some(if self.big_endian { u32::from_be_bytes(bytes) } else { u32::from_le_bytes(bytes) })
+    }
+
+    fn u64(self, at: usize) -> Option<u64> {
+        let bytes = self.array(at)?;
+        Some(if self.big_endian { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) })
+    }
+
+    /// The options from `at` on: code and value.
+    fn options(self, mut at: usize) -> impl Iterator<Item = (u16, Fields<'a>)> {
+        std::iter::from_fn(move || {
+            let (code, len) = (self.u16(at)?, usize::from(self.u16(at + 2)?));
+            let bytes = self.bytes.get(at + 4..at + 4 + len)?;
+            at += 4 + len.next_multiple_of(4);
+            (code != END).then_some((code, Fields { bytes, ..self }))
+        })
+    }
+}
+
+impl Decode for Decoder {
+    fn needs_one_line(&self) -> bool {
+        false
+    }
+
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
+        }
+        loop {
+            let place = Place::Offset(input.offset());
+            let head = input.peek(BLOCK_FRAME_BYTES)?;
+            if head.is_empty() {
+                return Ok(Found::End);
+            }
+            let have = head.len();
+            let Some(first) = head.first_chunk::<BLOCK_FRAME_BYTES>().copied() else {
+                input.consume(have);
+                return Ok(Found::Issue(place, Fault::Truncated("a block")));
+            };
+            if !self.byte_order(first) {
+                input.consume(have);
+                let fault =
+                    Fault::malformed("a pcapng file, which begins with a section header", &first[..4]);
+                return Ok(Found::Issue(place, fault));
+            }
+            let fields = Fields { bytes: &first, big_endian: self.big_endian };
+            let (kind, len) = (fields.u32(0).unwrap_or(0), fields.u32(4).unwrap_or(0) as usize);
+            let sane = (BLOCK_FRAME_BYTES..=MAX_BLOCK_BYTES).contains(&len) && len.is_multiple_of(4);
+            if sane {
+                let block = input.peek(len)?;
+                let have = block.len();
+                if have < len && !self.looks_cut(block) {
+                    self.resync(input)?;
+                    return Ok(Found::Issue(place, damaged(len)));
+                }
+                if have < len {
+                    input.consume(have);
+                    return Ok(Found::Issue(place, Fault::Truncated("a block")));
+                }
+                let big_endian = self.big_endian;
+                let fields = Fields { bytes: &block[8..len - 4], big_endian };
+                let behind = Fields { bytes: &block[len - 4..len], big_endian };
+                if behind.u32(0) == Some(len as u32) {
+                    let result = self.block(kind, fields);
+                    input.consume(len);
+                    match result {
+                        Ok(Some(record)) => return Ok(Found::Record(record)),
+                        Ok(None) => continue,
+                        Err(fault) => return Ok(Found::Issue(place, fault)),
+                    }
+                }
+            }
+            self.resync(input)?;
+            return Ok(Found::Issue(place, damaged(len)));
+        }
+    }
+}
+
+fn damaged(len: usize) -> Fault {
+    Fault::malformed("a block with the same length at both ends", format!("a length of {len}").as_bytes())
+}
+
+impl Decoder {
+    /// Takes the byte order from a section header. False if the file does not begin with one.
+    fn byte_order(&mut self, head: [u8; BLOCK_FRAME_BYTES]) -> bool {
+        if head[..4] != SECTION_HEADER.to_le_bytes() {
+            return self.started;
+        }
+        let magic = &head[8..];
+        if magic == BYTE_ORDER_MAGIC.to_be_bytes() {
+            self.big_endian = true;
+        } else if magic == BYTE_ORDER_MAGIC.to_le_bytes() {
+            self.big_endian = false;
+        } else {
+            return self.started;
+        }
+        self.started = true;
+        true
+    }
+
+    /// Whether the last bytes of the file can be the beginning of a block, or a damaged length points beyond.
+    fn looks_cut(&self, rest: &[u8]) -> bool {
+        (1..rest.len() / 4).all(|word| !self.is_block(&rest[4 * word..]))
+    }
+
+    /// Whether a whole, known block begins here.
+    fn is_block(&self, bytes: &[u8]) -> bool {
+        let fields = Fields { bytes, big_endian: self.big_endian };
+        let known = matches!(fields.u32(0), Some(SECTION_HEADER | INTERFACE_DESCRIPTION | ENHANCED_PACKET));
+        let Some(len) = fields.u32(4).map(|len| len as usize).filter(|_| known) else { return false };
+        (BLOCK_FRAME_BYTES..=4096).contains(&len) && fields.u32(len - 4) == Some(len as u32)
+    }
+
+    /// Goes on to the next block that is whole, or to the end.
+    fn resync(&self, input: &mut Input) -> io::Result<()> {
+        input.consume(4);
+        loop {
+            // Enough to see the whole of a packet's block.
+            let bytes = input.peek(8192)?;
+            if bytes.len() < BLOCK_FRAME_BYTES {
+                let rest = bytes.len();
+                input.consume(rest);
+                return Ok(());
+            }
+            if self.is_block(bytes) {
+                return Ok(());
+            }
+            input.consume(4);
+        }
+    }
+
+    #[inline]
+    fn block(&mut self, kind: u32, fields: Fields) -> Result<Option<TraceRecord>, Fault> {
+        let short = || Fault::malformed("a longer block", format!("{} bytes", fields.bytes.len()).as_bytes());
+        match kind {
+            SECTION_HEADER => {
+                self.interfaces.clear();
+                Ok(None)
+            }
+            INTERFACE_DESCRIPTION => {
+                self.describe(fields).ok_or_else(short)?;
+                Ok(None)
+            }
+            ENHANCED_PACKET | OBSOLETE_PACKET => {
+                let interface = match kind {
+                    ENHANCED_PACKET => fields.u32(0).ok_or_else(short)?,
+                    _ => u32::from(fields.u16(0).ok_or_else(short)?),
+                };
+                let high = fields.u32(4).ok_or_else(short)?;
+                let low = fields.u32(8).ok_or_else(short)?;
+                let len = fields.u32(12).ok_or_else(short)? as usize;
+                let packet = fields.bytes.get(20..).and_then(|rest| rest.get(..len)).ok_or_else(short)?;
+                let options = 20 + len.next_multiple_of(4);
+                let known = self.interfaces.get(interface as usize).copied();
+                let interface = known.ok_or_else(|| {
+                    Fault::malformed("a described interface", interface.to_string().as_bytes())
+                })?;
+                if interface.link_type != LINK_TYPE {
+                    return Err(Fault::Unsupported("a packet that is not SocketCAN".into()));
+                }
+                let time_ns = interface.time_ns(u64::from(high) << 32 | u64::from(low));
+                self.packet(interface.channel, time_ns, packet, fields, options).map(Some)
+            }
+            // It has no time.
+            SIMPLE_PACKET => Err(Fault::Unsupported("a packet without a time".into())),
+            _ => Ok(None),
+        }
+    }
+
+    fn describe(&mut self, fields: Fields) -> Option<()> {
+        let link_type = fields.u16(0)?;
+        fields.u32(4)?;
+        if self.interfaces.len() >= MAX_INTERFACES {
+            return Some(());
+        }
+        let mut name = format!("can{}", self.interfaces.len()).into_bytes();
+        let (mut resolution, mut offset_s) = (1_000_000, 0);
+        for (code, value) in fields.options(8) {
+            match code {
+                IF_NAME if !value.bytes.is_empty() => name = value.bytes.to_vec(),
+                IF_TSRESOL => {
+                    let exponent = value.bytes.first().copied().unwrap_or(6);
+                    let base: u64 = if exponent & 0x80 != 0 { 2 } else { 10 };
+                    resolution = base.checked_pow(u32::from(exponent & 0x7F)).unwrap_or(u64::MAX);
+                }
+                IF_TSOFFSET => offset_s = value.u64(0).unwrap_or(0).cast_signed(),
+                _ => {}
+            }
+        }
+        let channel = self.names.channel(&name);
+        self.interfaces.push(Interface { link_type, channel, resolution, offset_s });
+        Some(())
+    }
+
+    /// A SocketCAN packet.
+    #[inline]
+    fn packet(
+        &mut self,
+        channel: u8,
+        time_ns: i64,
+        packet: &[u8],
+        fields: Fields,
+        options: usize,
+    ) -> Result<TraceRecord, Fault> {
+        const FD_FORMAT: u8 = 0x04;
+        const XL_FORMAT: u8 = 0x80;
+        let (mut flags, mut dropped) = (0, 0);
+        for (code, value) in fields.options(options) {
+            match code {
+                EPB_FLAGS => flags = value.u32(0).unwrap_or(0),
+                EPB_DROPCOUNT => dropped = value.u64(0).unwrap_or(0),
+                _ => {}
+            }
+        }
+        let record = |event| TraceRecord { time_ns, channel, event };
+        let count = u32::try_from(dropped).unwrap_or(u32::MAX);
+        let lost = record(TraceEvent::Lost { stage: None, count, at_least: u64::from(count) < dropped });
+        let event = match packet {
+            _ if packet.len() < 8 => {
+                let found = format!("{} bytes", packet.len());
+                Err(Fault::malformed("a SocketCAN packet of at least 8 bytes", found.as_bytes()))
+            }
+            [_, _, _, _, len, ..] if len & XL_FORMAT != 0 => Err(Fault::Unsupported("a CAN XL frame".into())),
+            [_, _, _, _, len, kind, ..] if kind & FD_FORMAT != 0 || *len > 8 => {
+                Err(Fault::Unsupported("a CAN FD frame".into()))
+            }
+            _ => event(packet, flags, &mut self.error_frames),
+        };
+        match event {
+            Ok((event, second)) => {
+                // Our own error frame for a loss has the same count, and says more.
+                if dropped > 0 && !matches!(event, TraceEvent::Lost { .. }) {
+                    self.error_frames.keep([event].into_iter().chain(second).map(record));
+                    return Ok(lost);
+                }
+                self.error_frames.keep(second.map(record));
+                Ok(record(event))
+            }
+            Err(fault) => {
+                if dropped > 0 {
+                    self.error_frames.keep([lost]);
+                }
+                Err(fault)
+            }
+        }
+    }
+}
+
+/// What a classical packet says.
+#[inline]
+fn event(
+    packet: &[u8],
+    flags: u32,
+    error_frames: &mut ErrorFrames,
+) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
+    let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
+    let (len, raw_dlc) = (packet[4], packet[7]);
+    let mut data = [0; 8];
+    let present = packet[8..].len().min(usize::from(len)).min(8);
+    data[..present].copy_from_slice(&packet[8..8 + present]);
+    if id & ERROR_FLAG != 0 {
+        return Ok(error_frames.read(id, data));
+    }
+    let remote = id & REMOTE != 0;
+    if present < usize::from(len) && !remote {
+        return Err(Fault::malformed(format!("{len} data bytes"), format!("{present}").as_bytes()));
+    }
+    let raw = id & !(EXTENDED | REMOTE);
+    let parsed = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
+    let parsed = parsed
+        .ok_or_else(|| Fault::malformed("an identifier up to 0x7ff", format!("{raw:#x}").as_bytes()))?;
+    let dlc = if len == 8 && (9..=15).contains(&raw_dlc) { raw_dlc } else { len };
+    let direction = if flags & DIRECTION == OUTBOUND { Direction::Tx } else { Direction::Rx };
+    let frame = Frame::from_bus(parsed, remote, dlc, data);
+    Ok((TraceEvent::Frame { frame, direction, late: false }, None))
+}
+
+impl Interface {
+    /// A packet's time as nanoseconds since the epoch.
+    #[inline]
+    fn time_ns(&self, units: u64) -> i64 {
+        let ns_per_s = i128::from(NS_PER_S);
+        let ns = if self.resolution == NS_PER_S as u64 {
+            // Ours: before 1970 it wraps.
+            i128::from(units.cast_signed())
+        } else {
+            i128::from(units) * ns_per_s / i128::from(self.resolution)
+        };
+        let ns = ns + i128::from(self.offset_s) * ns_per_s;
+        i64::try_from(ns).unwrap_or(if ns < 0 { i64::MIN } else { i64::MAX })
+    }
+}

@@ -1,0 +1,235 @@
+//! Reading a trace of any format as a stream.
+
+use std::io::{self, Read};
+use std::path::Path;
+use std::sync::Arc;
+
+use super::codec::{BATCH, Decode};
+use super::found::Found;
+use super::input::Input;
+use super::issue::{Fault, Place, ReadIssue};
+use super::left_out::LeftOut;
+use super::{Format, UnknownFormat, asc, blf, candump, csv, dif, pcapng, trc};
+use cantap_trace::TraceRecord;
+
+/// How to read.
+#[derive(Clone, Debug, Default)]
+pub struct ReadOptions {
+    /// The format; by the file's suffix or first bytes if not given.
+    pub format: Option<Format>,
+    /// Wait for more at the end of the file instead of ending.
+    pub follow: bool,
+    /// End after the first issue.
+    pub strict: bool,
+}
+
+/// Why a file cannot be opened for reading.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum OpenError {
+    /// The system refused.
+    #[error("cannot open {0}: {1}")]
+    Io(String, #[source] io::Error),
+    /// Neither name nor content tell the format.
+    #[error(transparent)]
+    Format(#[from] UnknownFormat),
+}
+
+/// A trace being read: an iterator of records and issues in the file's order. Memory does not grow with
+/// the file.
+pub struct TraceReader {
+    name: Arc<str>,
+    format: Format,
+    input: Input,
+    decoder: Box<dyn Decode>,
+    /// Records decoded; those before `at` are used up.
+    batch: Vec<TraceRecord>,
+    at: usize,
+    /// What follows them.
+    after: Option<io::Result<Found>>,
+    strict: bool,
+    issues: u64,
+    notes: LeftOut,
+    ended: bool,
+}
+
+/// What comes behind a batch of records.
+enum Beyond {
+    Batch,
+    Issue(ReadIssue),
+    End,
+}
+
+/// Opens a trace file, or standard input for `-` (a candump log unless the options or the first bytes
+/// say otherwise). gzip and zstd are recognised by content.
+pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<TraceReader, OpenError> {
+    let path = path.as_ref();
+    let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
+    let failed = |error| OpenError::Io(name.clone(), error);
+    let mut input = Input::open(path, options.follow).map_err(failed)?;
+    let format = match options.format {
+        Some(format) => format,
+        None => match Format::of_path(path) {
+            Ok(format) => format,
+            Err(unknown) => {
+                // A pipe may give no more than a line for a long time.
+                let head =
+                    if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
+                match Format::of_content(head) {
+                    Some(format) => format,
+                    None if path.as_os_str() == "-" => Format::Candump,
+                    None => return Err(unknown.into()),
+                }
+            }
+        },
+    };
+    Ok(TraceReader::new(name.into(), format, input, options.strict))
+}
+
+impl TraceReader {
+    fn new(name: Arc<str>, format: Format, input: Input, strict: bool) -> Self {
+        let decoder: Box<dyn Decode> = match format {
+            Format::Candump => Box::new(candump::Decoder::default()),
+            Format::Asc => Box::new(asc::Decoder::default()),
+            Format::Blf => Box::new(blf::Decoder::default()),
+            Format::Trc(_) => Box::new(trc::Decoder::default()),
+            Format::Csv(_) => Box::new(csv::Decoder::default()),
+            Format::Pcapng => Box::new(pcapng::Decoder::default()),
+            Format::Dif => Box::new(dif::Decoder::default()),
+        };
+        let batch = Vec::with_capacity(BATCH);
+        Self {
+            name,
+            format,
+            input,
+            decoder,
+            batch,
+            at: 0,
+            after: None,
+            strict,
+            issues: 0,
+            notes: LeftOut::default(),
+            ended: false,
+        }
+    }
+
+    /// Reads from any source of bytes, plain or compressed. `name` is what issues call it.
+    pub fn from_source(
+        name: &str,
+        source: impl Read + Send + 'static,
+        format: Format,
+        options: &ReadOptions,
+    ) -> io::Result<Self> {
+        let input = Input::decompressing(Box::new(source), options.follow)?;
+        Ok(Self::new(name.into(), format, input, options.strict))
+    }
+
+    /// The file's format.
+    pub fn format(&self) -> Format {
+        self.format
+    }
+
+    /// While waiting for more of a file that is followed, ends as soon as this is true.
+    pub fn end_when(&mut self, stop: impl Fn() -> bool + Send + 'static) {
+        self.input.end_when(Box::new(stop));
+    }
+
+    /// Whether the next record may have to be waited for: what was read before is used up.
+    pub fn would_wait(&self) -> bool {
+        self.at == self.batch.len()
+            && self.after.is_none()
+            && !(self.decoder.needs_one_line() && self.input.has_line())
+    }
+
+    /// How many issues have come so far.
+    pub fn issues(&self) -> u64 {
+        self.issues
+    }
+
+    /// What is nothing wrong and should be known all the same, such as requests to send a frame that were passed over: so
+    /// far, and how often.
+    pub fn notes(&self) -> &LeftOut {
+        &self.notes
+    }
+
+    fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
+        self.issues += 1;
+        self.ended |= self.strict || matches!(fault, Fault::Io(_));
+        ReadIssue { file: self.name.clone(), place, fault }
+    }
+
+    /// What comes when the batch is used up. A new batch may be empty.
+    fn beyond_batch(&mut self) -> Beyond {
+        if self.ended {
+            return Beyond::End;
+        }
+        let Some(after) = self.after.take() else {
+            self.batch.clear();
+            self.at = 0;
+            self.after = self.decoder.batch(&mut self.input, &mut self.batch).transpose();
+            return Beyond::Batch;
+        };
+        match after {
+            Ok(Found::Record(record)) => {
+                self.batch.push(record);
+                Beyond::Batch
+            }
+            Ok(Found::Note(what)) => {
+                self.notes.note(what);
+                Beyond::Batch
+            }
+            Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),
+            Ok(Found::End) => {
+                self.ended = true;
+                if self.input.compressed_data_cut() {
+                    let place = Place::Offset(self.input.offset());
+                    return Beyond::Issue(self.issue(place, Fault::Truncated("the compressed data")));
+                }
+                Beyond::End
+            }
+            Err(error) => {
+                let place = Place::Offset(self.input.offset());
+                Beyond::Issue(self.issue(place, Fault::Io(error)))
+            }
+        }
+    }
+
+    /// Puts the next records, at least one and as many as are at hand, in the place of what is in `records`: for loops
+    /// that [`Iterator::next`] would be the slowest part of. `None` at the end.
+    pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Option<Result<(), ReadIssue>> {
+        records.clear();
+        while self.at == self.batch.len() {
+            match self.beyond_batch() {
+                Beyond::Batch => {}
+                Beyond::Issue(issue) => return Some(Err(issue)),
+                Beyond::End => return None,
+            }
+        }
+        if self.at == 0 {
+            std::mem::swap(records, &mut self.batch);
+        } else {
+            records.extend(self.batch.drain(..).skip(self.at));
+        }
+        self.at = 0;
+        Some(Ok(()))
+    }
+}
+
+impl Iterator for TraceReader {
+    type Item = Result<TraceRecord, ReadIssue>;
+
+    #[inline]
+    fn next(&mut self) -> Option<Self::Item> {
+        loop {
+            if let Some(record) = self.batch.get(self.at) {
+                self.at += 1;
+                return Some(Ok(*record));
+            }
+            match self.beyond_batch() {
+                Beyond::Batch => {}
+                Beyond::Issue(issue) => return Some(Err(issue)),
+                Beyond::End => return None,
+            }
+        }
+    }
+}

@@ -1,0 +1,70 @@
+//! What the tests of all formats share: files in memory.
+
+use std::io;
+use std::sync::{Arc, Mutex};
+
+use super::file_writer::FileWriter;
+use super::output::Output;
+use super::{Format, LeftOut, ReadOptions, TraceReader, TraceWriter, WriteOptions};
+use cantap_trace::TraceRecord;
+
+/// A file in memory.
+#[derive(Clone, Default)]
+struct Memory(Arc<Mutex<Vec<u8>>>);
+
+impl io::Write for Memory {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        self.0.lock().unwrap().extend_from_slice(bytes);
+        Ok(bytes.len())
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+/// What a format makes of records, and what it could not carry.
+pub(crate) fn write_with(options: &WriteOptions, records: &[TraceRecord]) -> (Vec<u8>, LeftOut) {
+    let memory = Memory::default();
+    let output = Output::Stream(Box::new(memory.clone()));
+    let mut writer = Box::new(FileWriter::new(output, options.format.unwrap(), options));
+    for record in records {
+        writer.write(record).unwrap();
+    }
+    let left_out = writer.finish().unwrap();
+    let bytes = std::mem::take(&mut *memory.0.lock().unwrap());
+    (bytes, left_out)
+}
+
+/// What a text format makes of records.
+pub(crate) fn write(format: Format, records: &[TraceRecord]) -> String {
+    let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
+    String::from_utf8(write_with(&options, records).0).unwrap()
+}
+
+/// The records in a file, and what is wrong with it.
+pub(crate) fn read(format: Format, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>, Vec<String>) {
+    let source = io::Cursor::new(bytes.as_ref().to_vec());
+    let reader = TraceReader::from_source("test", source, format, &ReadOptions::default()).unwrap();
+    let mut records = Vec::new();
+    let mut issues = Vec::new();
+    for item in reader {
+        match item {
+            Ok(record) => records.push(record),
+            Err(issue) => issues.push(issue.to_string()),
+        }
+    }
+    (records, issues)
+}
+
+/// Writes and reads; nothing may be left out or wrong.
+pub(crate) fn round_trip(format: Format, records: &[TraceRecord]) -> Vec<TraceRecord> {
+    let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
+    let (bytes, left_out) = write_with(&options, records);
+    // What is written here is no plain file.
+    let left_out = left_out.iter().find(|(what, _)| *what != super::dif::ROWS_UNTOLD);
+    assert_eq!(left_out, None);
+    let (records, issues) = read(format, bytes);
+    assert_eq!(issues, Vec::<String>::new());
+    records
+}

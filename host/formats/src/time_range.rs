@@ -1,0 +1,102 @@
+//! A part of a trace by time: from and to a point, absolute or counted from the trace's first record.
+
+use std::str::FromStr;
+
+use crate::{date_time_ns, decimal_seconds_ns};
+use cantap_trace::TraceRecord;
+
+/// A point in a trace.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum TimePoint {
+    /// Nanoseconds since the Unix epoch.
+    At(i64),
+    /// Nanoseconds after the trace's first record.
+    AfterFirst(i64),
+}
+
+/// Not a point in time.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "'{0}' is no time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
+     (1410714882.5), or a date in UTC (2014-09-14T17:14:42)"
+)]
+pub struct BadTime(String);
+
+/// Numbers from here on are seconds since 1970: it is 1990 then, and no trace is twenty years long.
+const FIRST_EPOCH_NS: i64 = 631_152_000_000_000_000;
+
+impl FromStr for TimePoint {
+    type Err = BadTime;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let bad = || BadTime(text.to_owned());
+        if let Some(time_ns) = date_time_ns(text.trim_end_matches('Z')) {
+            return Ok(Self::At(time_ns));
+        }
+        let (number, factor) = match text.as_bytes().last() {
+            Some(b's') => (&text[..text.len() - 1], 1),
+            Some(b'm') => (&text[..text.len() - 1], 60),
+            Some(b'h') => (&text[..text.len() - 1], 3600),
+            _ => (text, 1),
+        };
+        let value_ns = decimal_seconds_ns(number).and_then(|ns| ns.checked_mul(factor)).ok_or_else(bad)?;
+        let absolute = value_ns >= FIRST_EPOCH_NS && number.len() == text.len();
+        Ok(if absolute { Self::At(value_ns) } else { Self::AfterFirst(value_ns) })
+    }
+}
+
+/// Which part of a trace. The start belongs to it, the end does not.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct TimeRange {
+    start: Option<TimePoint>,
+    end: Option<TimePoint>,
+    first_ns: Option<i64>,
+}
+
+impl TimeRange {
+    /// From one point to another; open where there is none.
+    pub fn new(start: Option<TimePoint>, end: Option<TimePoint>) -> Self {
+        Self { start, end, first_ns: None }
+    }
+
+    /// Whether a record is in it. The first one asked about is the trace's first.
+    pub fn contains(&mut self, record: &TraceRecord) -> bool {
+        let first_ns = *self.first_ns.get_or_insert(record.time_ns);
+        let absolute = |point| match point {
+            TimePoint::At(time_ns) => time_ns,
+            TimePoint::AfterFirst(offset_ns) => first_ns.saturating_add(offset_ns),
+        };
+        self.start.is_none_or(|start| record.time_ns >= absolute(start))
+            && self.end.is_none_or(|end| record.time_ns < absolute(end))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap_trace::testing::data_record;
+
+    #[test]
+    fn points_are_seconds_from_the_first_record_or_dates() {
+        for (text, point) in [
+            ("12.5", TimePoint::AfterFirst(12_500_000_000)),
+            ("2m", TimePoint::AfterFirst(120_000_000_000)),
+            ("1410714882.5", TimePoint::At(1_410_714_882_500_000_000)),
+            ("2014-09-14T17:14:42.5Z", TimePoint::At(1_410_714_882_500_000_000)),
+            ("2014-09-14 17:14:42", TimePoint::At(1_410_714_882_000_000_000)),
+        ] {
+            assert_eq!(text.parse(), Ok(point), "{text}");
+        }
+        for bad in ["", "s", "noon", "1e5", "2014-13-01T00:00:00", "5d"] {
+            assert!(bad.parse::<TimePoint>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_window_has_its_start_and_not_its_end() {
+        let mut window = TimeRange::new(Some(TimePoint::AfterFirst(10)), Some(TimePoint::At(130)));
+        let times = [100, 109, 110, 129, 130];
+        let found = times.map(|time_ns| window.contains(&data_record(time_ns)));
+        assert_eq!(found, [false, false, true, true, false]);
+    }
+}

@@ -1,0 +1,268 @@
+//! PEAK's TRC, versions 1.0 to 2.1 (document "PEAK CAN TRC File Format", last update 2020-07-27): columns of text with
+//! times relative to a date in the head, lines ended by CR LF.
+//!
+//! What each version can carry differs; what it cannot is counted. Everything that is not a frame is
+//! written in the version's own form with an exact text beside it. Dates are taken as UTC.
+
+mod decode;
+mod encode;
+
+pub(crate) use decode::Decoder;
+pub(crate) use encode::Encoder;
+
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
+
+use super::sja1000;
+use cantap_trace::TraceEvent;
+
+/// A version of the format.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[non_exhaustive]
+pub enum TrcVersion {
+    /// Whole milliseconds, no direction, no bus number.
+    V1_0,
+    /// Tenths of milliseconds and the direction.
+    V1_1,
+    /// Microseconds and the bus number.
+    V1_2,
+    /// A column in reserve.
+    V1_3,
+    /// Columns named in the head; no bus number.
+    V2_0,
+    /// The bus number again.
+    V2_1,
+}
+
+impl TrcVersion {
+    /// As the file's head has it; it has none for 1.0.
+    fn name(self) -> &'static str {
+        match self {
+            Self::V1_0 => "1.0",
+            Self::V1_1 => "1.1",
+            Self::V1_2 => "1.2",
+            Self::V1_3 => "1.3",
+            Self::V2_0 => "2.0",
+            Self::V2_1 => "2.1",
+        }
+    }
+
+    /// Whether there is a column for the bus.
+    fn has_bus(self) -> bool {
+        matches!(self, Self::V1_2 | Self::V1_3 | Self::V2_1)
+    }
+
+    /// Whether the length column counts bytes instead of showing the code of the bus.
+    fn has_length(self) -> bool {
+        matches!(self, Self::V1_1 | Self::V2_0)
+    }
+
+    /// Digits of a millisecond.
+    fn decimals(self) -> u32 {
+        match self {
+            Self::V1_0 => 0,
+            Self::V1_1 => 1,
+            _ => 3,
+        }
+    }
+}
+
+/// Days from the format's day 0, 1899-12-30, to the Unix epoch.
+const EPOCH_DAY: i64 = 25_569;
+
+/// The identifier of a row that is a warning.
+const WARNING_ID: &[u8] = b"FFFFFFFF";
+
+// The hardware's status, as in PCAN-Basic's PCAN_ERROR_ codes.
+const OVERRUN: u32 = 0x02;
+const BUS_LIGHT: u32 = 0x04;
+const BUS_WARNING: u32 = 0x08;
+const BUS_OFF: u32 = 0x10;
+const QUEUE_OVERRUN: u32 = 0x40;
+const BUS_PASSIVE: u32 = 0x4_0000;
+
+// What an error row says it was.
+const BIT: u8 = 1;
+const FORM: u8 = 2;
+const STUFF: u8 = 4;
+const OTHER: u8 = 8;
+
+/// The status that tells of an event; 0 for those that are no status.
+fn status_of(event: &TraceEvent) -> u32 {
+    match event {
+        TraceEvent::Lost { stage: Some(LossStage::Controller), .. } => OVERRUN,
+        TraceEvent::Lost { .. } => QUEUE_OVERRUN,
+        TraceEvent::State { state: ErrorState::Warning, .. } => BUS_WARNING,
+        TraceEvent::State { state: ErrorState::Passive, .. } => BUS_PASSIVE,
+        TraceEvent::State { state: ErrorState::BusOff, .. } => BUS_OFF,
+        _ => 0,
+    }
+}
+
+/// What a status tells; `None` if it is about neither the bus nor a loss.
+fn event_of(status: u32) -> Option<TraceEvent> {
+    let state = |state| Some(TraceEvent::State { state, counters: None });
+    match status {
+        _ if status & OVERRUN != 0 => {
+            Some(TraceEvent::Lost { stage: Some(LossStage::Controller), count: 1, at_least: true })
+        }
+        _ if status & QUEUE_OVERRUN != 0 => Some(TraceEvent::Lost { stage: None, count: 1, at_least: true }),
+        _ if status & BUS_OFF != 0 => state(ErrorState::BusOff),
+        _ if status & BUS_PASSIVE != 0 => state(ErrorState::Passive),
+        _ if status & (BUS_WARNING | BUS_LIGHT) != 0 => state(ErrorState::Warning),
+        0 => state(ErrorState::Active),
+        _ => None,
+    }
+}
+
+/// An error row's type and position.
+fn error_code(kind: Option<BusErrorKind>) -> (u8, u8) {
+    const SEGMENT: u8 = 0x1F;
+    let class = match kind {
+        Some(BusErrorKind::Stuff) => STUFF,
+        Some(BusErrorKind::Form) => FORM,
+        Some(BusErrorKind::BitRecessive | BusErrorKind::BitDominant) => BIT,
+        Some(BusErrorKind::Acknowledgment | BusErrorKind::Crc) | None => OTHER,
+    };
+    (class, kind.map_or(0, |kind| sja1000::code(kind) & SEGMENT))
+}
+
+/// The error of an error row.
+fn error_of(class: u32, position: u8, counters: (u8, u8)) -> TraceEvent {
+    let other = 3 << 6 | position & 0x1F;
+    let kind = match class {
+        class if class == u32::from(STUFF) => Some(BusErrorKind::Stuff),
+        class if class == u32::from(FORM) => Some(BusErrorKind::Form),
+        class if class == u32::from(OTHER) => sja1000::kind(other),
+        _ => None,
+    };
+    TraceEvent::BusError { kind, counters: Some(counters) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use super::*;
+    use crate::{Format, LeftOut, WriteOptions};
+    use cantap_trace::testing::record;
+    use cantap_trace::{Direction, TraceRecord};
+    use cantap_wire::Frame;
+    use proptest::prelude::*;
+
+    const VERSIONS: [TrcVersion; 6] = [
+        TrcVersion::V1_0,
+        TrcVersion::V1_1,
+        TrcVersion::V1_2,
+        TrcVersion::V1_3,
+        TrcVersion::V2_0,
+        TrcVersion::V2_1,
+    ];
+
+    /// What a version keeps of a record.
+    fn kept(version: TrcVersion, record: &TraceRecord) -> TraceRecord {
+        let mut kept = *record;
+        let is_frame = record.frame().is_some();
+        // The texts of events name the channel.
+        if !version.has_bus() && is_frame {
+            kept.channel = 1;
+        }
+        if let TraceEvent::Frame { frame, direction, .. } = &mut kept.event {
+            if version == TrcVersion::V1_0 {
+                *direction = Direction::Rx;
+            }
+            if version.has_length() {
+                *frame =
+                    Frame::from_bus(frame.id(), frame.is_remote(), frame.dlc().min(8), frame.padded_data());
+            }
+        }
+        kept
+    }
+
+    proptest! {
+        #[test]
+        fn any_trace_round_trips_as_far_as_the_version_carries(
+            records in prop::collection::vec(record(1_000_000), 0..12)
+        ) {
+            for version in VERSIONS {
+                let options = WriteOptions { format: Some(Format::Trc(version)), ..WriteOptions::default() };
+                let (bytes, left_out) = tests::write_with(&options, &records);
+                let (read, issues) = tests::read(Format::Trc(version), bytes);
+                let expected: Vec<_> = records.iter().map(|record| kept(version, record)).collect();
+                prop_assert_eq!(issues, Vec::<String>::new());
+                prop_assert_eq!(&read, &expected, "{:?}", version);
+                prop_assert_eq!(left_out == LeftOut::default(), expected == records, "{:?}", version);
+            }
+        }
+
+        #[test]
+        fn the_latest_version_keeps_microseconds(records in prop::collection::vec(record(1000), 0..12)) {
+            prop_assert_eq!(tests::round_trip(Format::Trc(TrcVersion::V2_1), &records), records);
+        }
+    }
+
+    /// Rows as PEAK's own programs write them.
+    #[test]
+    fn peaks_own_rows_are_read() {
+        let files = [
+            ";   Start time: 18.12.2021 14:28:07.062\r\n\
+             \x20    1)     17535  00000100  2  01 02\r\n\
+             \x20    2)     17540  FFFFFFFF  4  00 00 00 08 -- -- -- -- BUSHEAVY\r\n\
+             \x20    3)     17541      0008  4  ERROR 00 19 08 09\r\n\
+             \x20    4)     48937      0704  1  RTR",
+            ";$FILEVERSION=1.1\r\n;$STARTTIME=44548.6028595139\r\n\
+             \x20    1)     17535.0  Rx     00000100  2  01 02 \r\n\
+             \x20    2)     17540.0  Warng  FFFFFFFF  4  00 00 00 08  BUSHEAVY \r\n\
+             \x20    3)     17541.0  Error      0008  4  00 19 08 09\r\n\
+             \x20    4)     48937.0  Rx         0704  1  RTR",
+            ";$FILEVERSION=1.3\r\n;$STARTTIME=44548.6028595139\r\n\
+             \x20    1)     17535.000 1  Rx    00000100 -  2    01 02\r\n\
+             \x20    2)     17540.000 1  Warng FFFFFFFF -  4    00 00 00 08 BUSHEAVY\r\n\
+             \x20    3)     17541.000 1  Error     0008 -  4    00 19 08 09\r\n\
+             \x20    4)     48937.000 1  Rx        0704 -  1    RTR",
+            ";$FILEVERSION=2.0\r\n;$STARTTIME=44548.6028595139\r\n;$COLUMNS=N,O,T,I,d,l,D\r\n\
+             \x20     1     17535.000 DT 00000100 Rx 2  01 02\r\n\
+             \x20     2     17540.000 ST          Rx    00 00 00 08\r\n\
+             \x20     3     17541.000 ER          Rx    08 00 19 08 09\r\n\
+             \x20     4     48937.000 RR     0704 Rx 1",
+            ";$FILEVERSION=2.1\r\n;$STARTTIME=44548.6028595139\r\n;$COLUMNS=N,O,T,B,I,d,R,L,D\r\n\
+             \x20     1     17535.000 DT 1  00000100 Rx -  2    01 02\r\n\
+             \x20     2     17540.000 ST 1         - Rx -  4    00 00 00 08\r\n\
+             \x20     3     17541.000 ER 1         - Rx -  5    08 00 19 08 09\r\n\
+             \x20     4     48937.000 RR 1      0704 Rx -  1",
+        ];
+        for file in files {
+            let (mut records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), file);
+            assert_eq!(issues, Vec::<String>::new(), "{file}");
+            // The day's fraction has a resolution of 9 µs.
+            for record in &mut records {
+                record.time_ns = (record.time_ns + 500_000) / 1_000_000 * 1_000_000;
+            }
+            assert_eq!(
+                tests::write(Format::Candump, &records),
+                "(1639837704.597000) can0 00000100#0102\n\
+                 (1639837704.602000) can0 20000084#000C000000000000\n\
+                 (1639837704.603000) can0 200002A0#0000000000000908\n\
+                 (1639837735.999000) can0 704#R1\n",
+                "{file}"
+            );
+        }
+    }
+
+    #[test]
+    fn broken_rows_are_named() {
+        let file = ";$FILEVERSION=2.1\r\n;$STARTTIME=44548.6\r\n;$COLUMNS=N,O,T,B,I,d,R,L,D\r\n\
+                    1 1.0 DT 1 0100 Rx - 2 01\r\n2 x DT 1 0100 Rx - 0\r\n3 1.0 FD 1 0100 Rx - 2 01 02\r\n\
+                    4 1.0 DT 1 0900 Rx - 0\r\n5 1.0 DT\r\n6 1.0 DT 1 0100 Rx - 0\r\n";
+        let (records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), file);
+        assert_eq!(records.len(), 1);
+        assert_eq!(
+            issues,
+            [
+                "test, line 4: expected 2 data bytes, found '01'",
+                "test, line 5: expected a time in milliseconds, found 'x'",
+                "test, line 6: a CAN FD frame cannot be represented and is left out",
+                "test, line 7: expected an identifier of 4 digits up to 07FF or 8 up to 1FFFFFFF, found '0900'",
+                "test, line 8: expected a bus number, found nothing",
+            ]
+        );
+    }
+}

@@ -1,0 +1,332 @@
+//! Reading TRC.
+
+use std::io;
+
+use cantap_wire::record::ErrorState;
+use cantap_wire::{Frame, Id};
+
+use super::super::calendar::{Date, NS_PER_DAY};
+use super::super::codec::Decode;
+use super::super::event_text;
+use super::super::found::Found;
+use super::super::input::Input;
+use super::super::issue::Fault;
+use super::super::text;
+use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+const NS_PER_MS: i64 = 1_000_000;
+
+/// Most columns a row can have before its data.
+const MAX_COLUMNS: usize = 16;
+
+/// Reads TRC.
+pub(crate) struct Decoder {
+    version: TrcVersion,
+    start_ns: i64,
+    has_start: bool,
+    layout: Layout,
+    /// The row before told an event exactly; a row of the format's own for it follows.
+    told: Option<TraceRecord>,
+}
+
+/// Which column has what, counted from 0.
+#[derive(Clone, Copy, Debug)]
+struct Layout {
+    offset: usize,
+    kind: Option<usize>,
+    bus: Option<usize>,
+    id: usize,
+    direction: Option<usize>,
+    len: usize,
+    data: usize,
+}
+
+impl Layout {
+    /// The fixed columns of version 1, and those that 2.1 has unless the head says otherwise.
+    fn of(version: TrcVersion) -> Self {
+        let fixed = |kind, bus, id, len| {
+            let direction = kind;
+            Self { offset: 1, kind, bus, id, direction, len, data: len + 1 }
+        };
+        match version {
+            TrcVersion::V1_0 => fixed(None, None, 2, 3),
+            TrcVersion::V1_1 => fixed(Some(2), None, 3, 4),
+            TrcVersion::V1_2 => fixed(Some(3), Some(2), 4, 5),
+            TrcVersion::V1_3 => fixed(Some(3), Some(2), 4, 6),
+            TrcVersion::V2_0 => Self::named(b"N,O,T,I,d,l,D").unwrap_or(fixed(None, None, 3, 5)),
+            TrcVersion::V2_1 => Self::named(b"N,O,T,B,I,d,R,L,D").unwrap_or(fixed(None, None, 4, 7)),
+        }
+    }
+
+    /// The columns that `$COLUMNS` names.
+    fn named(names: &[u8]) -> Option<Self> {
+        let names: Vec<&[u8]> = names.split(|byte| *byte == b',').map(<[u8]>::trim_ascii).collect();
+        let find = |name: &[u8]| names.iter().position(|known| *known == name);
+        if names.len() > MAX_COLUMNS {
+            return None;
+        }
+        Some(Self {
+            offset: find(b"O")?,
+            kind: find(b"T"),
+            bus: find(b"B"),
+            id: find(b"I")?,
+            direction: find(b"d"),
+            len: find(b"L").or_else(|| find(b"l"))?,
+            data: find(b"D")?,
+        })
+    }
+}
+
+impl Default for Decoder {
+    fn default() -> Self {
+        let version = TrcVersion::V1_0;
+        Self { version, start_ns: 0, has_start: false, layout: Layout::of(version), told: None }
+    }
+}
+
+impl Decode for Decoder {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        while let Some(line) = input.line()? {
+            let text = line.text.trim_ascii();
+            let result = match text {
+                [] => Ok(None),
+                [b';', comment @ ..] => self.head(comment).map(|()| None),
+                _ => self.row(text),
+            };
+            match result {
+                Ok(row)
+                    if !line.terminated
+                        && !matches!(text, [] | [b';', ..])
+                        && !row.is_some_and(|record| self.is_sure(&record)) =>
+                {
+                    return Ok(line.cut());
+                }
+                Ok(Some(record)) => return Ok(Found::Record(record)),
+                Ok(None) => {}
+                Err(fault) => return Ok(line.issue(fault)),
+            }
+        }
+        Ok(Found::End)
+    }
+}
+
+impl Decoder {
+    /// Whether a row without its line end lost nothing. Nobody can tell what an event's row lost, and in version 1 whether
+    /// RTR would have followed a length of 0; any other frame that lost something is an error.
+    fn is_sure(&self, record: &TraceRecord) -> bool {
+        let v1 = self.version < TrcVersion::V2_0;
+        record.frame().is_some_and(|frame| frame.dlc() > 0 || frame.is_remote() || !v1)
+    }
+
+    /// A line of the head, without the semicolon.
+    fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
+        let value = |name: &[u8]| line.strip_prefix(name).map(<[u8]>::trim_ascii);
+        if let Some(version) = value(b"$FILEVERSION=") {
+            self.version = match version {
+                b"1.0" => TrcVersion::V1_0,
+                b"1.1" => TrcVersion::V1_1,
+                b"1.2" => TrcVersion::V1_2,
+                b"1.3" => TrcVersion::V1_3,
+                b"2.0" => TrcVersion::V2_0,
+                b"2.1" => TrcVersion::V2_1,
+                other => return Err(Fault::malformed("a version from 1.0 to 2.1", other)),
+            };
+            self.layout = Layout::of(self.version);
+        } else if let Some(days) = value(b"$STARTTIME=") {
+            self.start_ns = time_of_days(days)
+                .ok_or_else(|| Fault::malformed("days since 1899-12-30, such as 44548.6028595139", days))?;
+            self.has_start = true;
+        } else if let Some(names) = value(b"$COLUMNS=") {
+            self.layout = Layout::named(names)
+                .ok_or_else(|| Fault::malformed("column names such as N,O,T,B,I,d,R,L,D", names))?;
+        } else if let Some(start) = line.trim_ascii().strip_prefix(b"Start time:")
+            && !self.has_start
+            && let Some(start_ns) = date(start.trim_ascii())
+        {
+            self.start_ns = start_ns;
+        }
+        Ok(())
+    }
+
+    fn row(&mut self, row: &[u8]) -> Result<Option<TraceRecord>, Fault> {
+        let mut columns: [&[u8]; MAX_COLUMNS] = [b""; MAX_COLUMNS];
+        let mut rest = row;
+        for column in &mut columns[..self.layout.data.min(MAX_COLUMNS)] {
+            (*column, rest) = text::word(rest);
+        }
+        let told = self.told.take();
+        let layout = self.layout;
+        let time = columns[layout.offset];
+        let offset_ns = text::time(time, NS_PER_MS, b'.')
+            .ok_or_else(|| Fault::malformed("a time in milliseconds", time))?;
+        let time_ns = self.start_ns.saturating_add(offset_ns);
+        let kind = layout.kind.map_or(&b""[..], |at| columns[at]);
+        let frame_kind = match kind {
+            b"" if layout.kind.is_none() => {
+                columns[layout.id] != WARNING_ID && !rest.trim_ascii().starts_with(b"ERROR")
+            }
+            b"Rx" | b"Tx" if self.version < TrcVersion::V2_0 => true,
+            b"DT" | b"RR" => true,
+            b"FD" | b"FB" | b"FE" | b"BI" => return Err(Fault::Unsupported("a CAN FD frame".into())),
+            _ => false,
+        };
+        if !frame_kind {
+            return Ok(self.event(row, kind, columns, time_ns, told));
+        }
+        let bus = layout.bus.map(|at| columns[at]);
+        let channel = match bus {
+            Some(bus) => text::decimal(bus)
+                .and_then(|bus| u8::try_from(bus).ok())
+                .ok_or_else(|| Fault::malformed("a bus number", bus))?,
+            None => 1,
+        };
+        let id = identifier(columns[layout.id])?;
+        let direction = match layout.direction.map(|at| columns[at]) {
+            Some(b"Tx") => Direction::Tx,
+            _ => Direction::Rx,
+        };
+        let len = columns[layout.len];
+        let dlc = text::decimal(len)
+            .filter(|dlc| *dlc <= 15)
+            .ok_or_else(|| Fault::malformed("a length of 0 to 15", len))? as u8;
+        let remote = kind == b"RR" || text::word(rest).0 == b"RTR";
+        let mut data = [0; 8];
+        if !remote {
+            let mut bytes = rest;
+            for slot in &mut data[..usize::from(dlc.min(8))] {
+                let (word, after) = text::word(bytes);
+                *slot = match word {
+                    [high, low] => text::hex_pair(*high, *low),
+                    _ => None,
+                }
+                .ok_or_else(|| Fault::malformed(format!("{} data bytes", dlc.min(8)), rest.trim_ascii()))?;
+                bytes = after;
+            }
+        }
+        let frame = Frame::from_bus(id, remote, dlc, data);
+        let event = TraceEvent::Frame { frame, direction, late: false };
+        Ok(Some(TraceRecord { time_ns, channel, event }))
+    }
+
+    /// A row that is no frame. Those of no interest give nothing.
+    fn event(
+        &mut self,
+        row: &[u8],
+        kind: &[u8],
+        columns: [&[u8]; MAX_COLUMNS],
+        time_ns: i64,
+        told: Option<TraceRecord>,
+    ) -> Option<TraceRecord> {
+        if let Some(event) = event_text::marked(row) {
+            let record = TraceRecord { time_ns, channel: named_channel(row), event };
+            if self.version >= TrcVersion::V2_0 {
+                self.told = Some(record);
+            }
+            return Some(record);
+        }
+        let channel = self.layout.bus.and_then(|at| text::decimal(columns[at]));
+        let channel = channel.and_then(|bus| u8::try_from(bus).ok()).unwrap_or(1);
+        let bytes = data_bytes(row, self.version >= TrcVersion::V2_0);
+        let event = match (kind, &bytes[..]) {
+            // Version 1 has the type in the identifier's place.
+            (b"Error" | b"", [_, position, rec, tec, ..]) if columns[self.layout.id] != WARNING_ID => {
+                error_of(text::hex(columns[self.layout.id])?, *position, (*tec, *rec))
+            }
+            (b"ER", [class, _, position, rec, tec, ..]) => {
+                error_of(u32::from(*class), *position, (*tec, *rec))
+            }
+            (b"Warng" | b"ST" | b"", [a, b, c, d, ..]) => event_of(u32::from_be_bytes([*a, *b, *c, *d]))?,
+            (b"EC", [rec, tec, ..]) => {
+                let state = match tec.max(rec) {
+                    128.. => ErrorState::Passive,
+                    96.. => ErrorState::Warning,
+                    _ => ErrorState::Active,
+                };
+                TraceEvent::State { state, counters: Some((*tec, *rec)) }
+            }
+            _ => return None,
+        };
+        let record = TraceRecord { time_ns, channel, event };
+        let same = |told: TraceRecord| {
+            told.time_ns == time_ns
+                && std::mem::discriminant(&told.event) == std::mem::discriminant(&record.event)
+        };
+        (!told.is_some_and(same)).then_some(record)
+    }
+}
+
+/// The channel that an event's text names.
+fn named_channel(row: &[u8]) -> u8 {
+    let Some(at) = memchr::memmem::find(row, b"CAN ") else { return 1 };
+    let number = text::decimal(text::word(&row[at + 4..]).0);
+    number.and_then(|number| u8::try_from(number).ok()).unwrap_or(1)
+}
+
+/// The data bytes of a row that leaves columns empty, so that they cannot be counted: in version 2 the pairs of
+/// digits behind the direction, in version 1 those behind a length of 4.
+fn data_bytes(row: &[u8], version_2: bool) -> Vec<u8> {
+    let mut words = row.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+    let found = if version_2 {
+        words.any(|word| word == b"Rx" || word == b"Tx")
+    } else {
+        words.by_ref().nth(1).is_some() && words.any(|word| word == b"4")
+    };
+    if !found {
+        return Vec::new();
+    }
+    let pair = |word: &[u8]| match word {
+        [high, low] => text::hex_pair(*high, *low),
+        _ => None,
+    };
+    words.filter_map(pair).take(8).collect()
+}
+
+fn identifier(digits: &[u8]) -> Result<Id, Fault> {
+    let raw = text::hex(digits);
+    // python-can writes 29-bit identifiers with seven digits.
+    let id = match digits.len() {
+        0..=4 => raw.and_then(Id::standard),
+        _ => raw.and_then(Id::extended),
+    };
+    id.ok_or_else(|| Fault::malformed("an identifier of 4 digits up to 07FF or 8 up to 1FFFFFFF", digits))
+}
+
+/// Days since 1899-12-30 as nanoseconds since the Unix epoch, to a microsecond: more the digits do not say.
+fn time_of_days(days: &[u8]) -> Option<i64> {
+    const NS_PER_US: i128 = 1000;
+    // Decimal digits of a day, exactly: a float would be wrong by half a microsecond.
+    const DIGITS: u32 = 18;
+    let (whole, fraction) = match days.iter().position(|byte| *byte == b'.') {
+        Some(at) => (&days[..at], &days[at + 1..]),
+        None => (days, &b""[..]),
+    };
+    let (negative, whole) = whole.strip_prefix(b"-").map_or((false, whole), |whole| (true, whole));
+    let fraction = &fraction[..fraction.len().min(DIGITS as usize)];
+    let scale = 10_i128.pow(DIGITS - fraction.len() as u32);
+    let fraction = if fraction.is_empty() { 0 } else { i128::from(text::decimal(fraction)?) * scale };
+    let days = i128::from(text::decimal(whole)?) * 10_i128.pow(DIGITS) + fraction;
+    let days = if negative { -days } else { days } - i128::from(EPOCH_DAY) * 10_i128.pow(DIGITS);
+    let unit = 10_i128.pow(DIGITS) * NS_PER_US;
+    let us = (days.checked_mul(i128::from(NS_PER_DAY))? + unit / 2).div_euclid(unit);
+    i64::try_from(us * NS_PER_US).ok()
+}
+
+/// `18.12.2021 14:28:07.062`, with further digits or fields behind it.
+fn date(text: &[u8]) -> Option<i64> {
+    let text = std::str::from_utf8(text).ok()?;
+    let (day, clock) = text.split_once(' ')?;
+    let mut day = day.splitn(3, '.').map(str::parse::<u16>);
+    let mut next = || day.next().and_then(Result::ok);
+    let (day, month, year) = (next()?, next()?, next()?);
+    let mut clock = clock.trim().splitn(3, ':');
+    let hour = text::decimal(clock.next()?.as_bytes())?;
+    let minute = text::decimal(clock.next()?.as_bytes())?;
+    // Tenths of a millisecond follow behind a second point.
+    let second: String = clock.next()?.splitn(3, '.').take(2).collect::<Vec<_>>().join(".");
+    let second_ns = text::time(second.as_bytes(), text::NS_PER_S, b'.').filter(|ns| *ns >= 0)?;
+    let second = (second_ns / text::NS_PER_S) as u64;
+    let of_day_ns = Date::of_day(hour, minute, second, second_ns % text::NS_PER_S)?;
+    Date { year: i64::from(year), month: u8::try_from(month).ok()?, day: u8::try_from(day).ok()?, of_day_ns }
+        .time_ns()
+}

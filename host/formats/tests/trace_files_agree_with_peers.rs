@@ -1,0 +1,413 @@
+//! Other programs read our files and we read theirs: python-can, Wireshark's tshark, can-utils.
+//!
+//! python-can is in `CANTAP_PYTHON`, else `python3`. A peer that is missing is named and its test passes,
+//! unless `CANTAP_REQUIRE_PEERS=1`.
+
+mod traces;
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use cantap_formats::{CsvDialect, Format, TrcVersion};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use traces::{directory, file_name, frames, odd, read, real, write};
+
+const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
+
+fn python() -> String {
+    std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned())
+}
+
+fn peers_are_required() -> bool {
+    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
+}
+
+/// A program's output, or `None` after saying that it is missing. One that is there and fails is a failure.
+fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
+    let there = Command::new(command.get_program()).args(probe).output();
+    if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
+        assert!(!peers_are_required(), "{peer} is required and does not run");
+        eprintln!("SKIPPED: {peer} is not installed, so nothing was compared with it");
+        return None;
+    }
+    let output = command.env("TZ", "UTC").output().unwrap();
+    assert!(output.status.success(), "{peer}: {}", String::from_utf8_lossy(&output.stderr));
+    Some(String::from_utf8(output.stdout).unwrap())
+}
+
+fn python_can(arguments: &[&Path], command: &str) -> Option<String> {
+    run("python-can", &["-c", "import can"], Command::new(python()).arg(SCRIPT).arg(command).args(arguments))
+}
+
+/// What python-can reads from files, by file.
+fn python_can_reads(paths: &[PathBuf]) -> Option<BTreeMap<PathBuf, Vec<String>>> {
+    let arguments: Vec<_> = paths.iter().map(PathBuf::as_path).collect();
+    let text = python_can(&arguments, "dump")?;
+    let mut files: BTreeMap<PathBuf, Vec<String>> = BTreeMap::new();
+    let mut current = PathBuf::new();
+    for line in text.lines() {
+        match line.strip_prefix("file ") {
+            Some(path) => {
+                current = path.into();
+                files.insert(current.clone(), Vec::new());
+            }
+            None => files.get_mut(&current).unwrap().push(line.to_owned()),
+        }
+    }
+    Some(files)
+}
+
+/// What a format leaves of a line.
+#[derive(Clone, Copy)]
+struct Carries {
+    step_us: i64,
+    channel: Option<u8>,
+    direction: bool,
+    /// Whether a remote frame keeps its length.
+    remote_length: bool,
+    /// What else than frames python-can gets.
+    events: Events,
+    /// Subtracted from all times.
+    from_us: i64,
+}
+
+/// Which events come as error frames.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Events {
+    /// None: its reader passes over them.
+    None,
+    /// Bus errors; states and losses have forms that it passes over.
+    BusErrors,
+    /// All, as SocketCAN's error frames, and without their channel.
+    All,
+}
+
+const EVERYTHING: Carries = Carries {
+    step_us: 1,
+    channel: None,
+    direction: true,
+    remote_length: true,
+    events: Events::BusErrors,
+    from_us: 0,
+};
+
+/// A record as the script prints it; `None` for what python-can has no message for.
+fn line(record: &TraceRecord, carries: Carries) -> Option<String> {
+    // python-can's times are floating-point numbers.
+    let micros = (record.time_ns + 500).div_euclid(1000).div_euclid(carries.step_us) * carries.step_us
+        - carries.from_us;
+    let channel = carries.channel.unwrap_or(record.channel);
+    let (frame, direction) = match &record.event {
+        TraceEvent::Frame { frame, direction, .. } => (frame, *direction),
+        event => {
+            let is_bus_error = matches!(event, TraceEvent::BusError { .. });
+            let comes = carries.events == Events::All || is_bus_error && carries.events == Events::BusErrors;
+            let channel = if carries.events == Events::All { 0 } else { channel };
+            return comes.then(|| format!("{micros} {channel} Rx error"));
+        }
+    };
+    let direction = if direction == Direction::Tx && carries.direction { "Tx" } else { "Rx" };
+    let kind = if frame.is_remote() { "remote" } else { "data" };
+    let extended = if frame.id().is_extended() { "x" } else { "-" };
+    let digits = frame.data().iter().flat_map(|byte| [byte >> 4, byte & 15]);
+    let data: String = digits.map(|digit| char::from(b"0123456789ABCDEF"[usize::from(digit)])).collect();
+    let data = if data.is_empty() { "-".to_owned() } else { data };
+    let dlc = if frame.is_remote() && !carries.remote_length { 0 } else { frame.dlc() };
+    let id = frame.id().raw();
+    Some(format!("{micros} {channel} {direction} {kind} {id:X} {extended} {dlc} {data}"))
+}
+
+fn lines(records: &[TraceRecord], carries: Carries) -> Vec<String> {
+    records.iter().filter_map(|record| line(record, carries)).collect()
+}
+
+/// Real traffic, and records of every kind behind it.
+fn records_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
+    let mut records = real(1000);
+    let last_ns = records.last().unwrap().time_ns;
+    let odd = odd(directory);
+    let first_ns = odd[0].time_ns;
+    records.extend(odd.iter().map(|record| TraceRecord {
+        time_ns: record.time_ns - first_ns + last_ns + 1_000_000_000,
+        ..*record
+    }));
+    records
+}
+
+/// Only the frames among them.
+fn frames_of_every_kind(directory: &Path) -> Vec<TraceRecord> {
+    frames(&records_of_every_kind(directory))
+}
+
+/// What python-can's readers can give back of each format.
+fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
+    let version = |version, step_us, channel, direction| {
+        // It does not read the date in the head of version 1.0.
+        let from_us = if version == TrcVersion::V1_0 { start_us / step_us * step_us } else { 0 };
+        let events = Events::None;
+        (Format::Trc(version), Carries { step_us, channel, direction, events, from_us, ..EVERYTHING })
+    };
+    vec![
+        (Format::Candump, Carries { events: Events::All, ..EVERYTHING }),
+        (Format::Asc, EVERYTHING),
+        (Format::Blf, EVERYTHING),
+        (
+            Format::Csv(CsvDialect::PythonCan),
+            Carries { channel: Some(0), direction: false, events: Events::All, ..EVERYTHING },
+        ),
+        version(TrcVersion::V2_1, 1, None, true),
+        version(TrcVersion::V2_0, 1, Some(1), true),
+        version(TrcVersion::V1_3, 1, None, true),
+        version(TrcVersion::V1_1, 100, Some(1), true),
+        version(TrcVersion::V1_0, 1000, Some(1), false),
+    ]
+}
+
+#[test]
+fn python_can_reads_every_record_of_the_files_we_write() {
+    let directory = directory("python_can_reads");
+    let records = records_of_every_kind(&directory);
+    let formats = python_can_formats(records[0].time_ns / 1000);
+    let paths: Vec<_> = formats.iter().map(|(format, _)| directory.join(file_name(*format, ""))).collect();
+    for ((format, _), path) in formats.iter().zip(&paths) {
+        write(path, *format, &records);
+    }
+    let Some(read) = python_can_reads(&paths) else { return };
+    for ((format, carries), path) in formats.iter().zip(&paths) {
+        let expected = lines(&records, *carries);
+        for (line, (theirs, ours)) in read[path].iter().zip(&expected).enumerate() {
+            assert_eq!(theirs, ours, "{format}, message {line}");
+        }
+        assert_eq!(read[path].len(), expected.len(), "{format}");
+    }
+}
+
+#[test]
+fn we_read_every_message_of_the_files_that_python_can_writes() {
+    let directory = directory("python_can_writes");
+    let records = records_of_every_kind(&directory);
+    let source = directory.join("messages.txt");
+    fs::write(&source, lines(&records, EVERYTHING).join("\n")).unwrap();
+    let table = Carries { channel: Some(1), direction: false, ..EVERYTHING };
+    // It writes remote frames into a log without their length.
+    let log = Carries { remote_length: false, ..EVERYTHING };
+    let cases = [
+        ("a.log", log),
+        ("a.asc", EVERYTHING),
+        ("a.blf", EVERYTHING),
+        ("a.csv", table),
+        ("a.trc", EVERYTHING),
+        ("a.log.gz", log),
+    ];
+    let paths: Vec<_> = cases.iter().map(|(name, _)| directory.join(name)).collect();
+    let arguments: Vec<_> = std::iter::once(&source).chain(&paths).map(PathBuf::as_path).collect();
+    if python_can(&arguments, "write").is_none() {
+        return;
+    }
+    for ((name, carries), path) in cases.iter().zip(&paths) {
+        let (read, issues) = read(path);
+        assert_eq!(issues, Vec::<String>::new(), "{name}");
+        // It cuts the date in the head to milliseconds, but not what the times count from.
+        let (ours, mut expected) = if *name == "a.asc" {
+            (from_start(&read), from_start(&records))
+        } else {
+            (lines(&read, EVERYTHING), lines(&records, *carries))
+        };
+        if *name == "a.trc" {
+            // It writes none into PEAK's files, and says so in a warning.
+            expected.retain(|line| !line.contains(" remote ") && !line.ends_with(" error"));
+        }
+        for (at, (ours, expected)) in ours.iter().zip(&expected).enumerate() {
+            assert_eq!(ours, expected, "{name}, message {at}");
+        }
+        assert_eq!(ours.len(), expected.len(), "{name}");
+    }
+}
+
+#[test]
+fn wireshark_and_we_read_each_others_pcapng_files() {
+    let directory = directory("wireshark");
+    let mut records = records_of_every_kind(&directory);
+    for record in &mut records {
+        record.time_ns += 7;
+    }
+    let (ours, theirs) = (directory.join("ours.pcapng"), directory.join("theirs.pcapng"));
+    write(&ours, Format::Pcapng, &records);
+    let fields =
+        ["frame.time_epoch", "frame.interface_name", "can.flags.err", "can.flags.xtd", "can.flags.rtr"];
+    let mut command = Command::new("tshark");
+    command.arg("-r").arg(&ours).args(["-T", "fields", "-E", "separator=/s"]);
+    for field in fields.iter().chain(&["can.len", "can.id"]) {
+        command.args(["-e", field]);
+    }
+    let Some(text) = run("tshark", &["--version"], &mut command) else { return };
+    let flag = |flag| if flag { "(1|True)" } else { "(0|False)" };
+    assert_eq!(text.lines().count(), records.len());
+    for (line, record) in text.lines().zip(&records) {
+        let (seconds, nanos) = (record.time_ns / 1_000_000_000, record.time_ns % 1_000_000_000);
+        let start = format!("{seconds}.{nanos:09} can{} ", record.channel - 1);
+        let rest =
+            line.strip_prefix(&start).unwrap_or_else(|| panic!("'{line}' does not begin with '{start}'"));
+        let words: Vec<_> = rest.split(' ').collect();
+        assert!(flag(record.frame().is_none()).contains(words[0]), "{line}");
+        let Some(frame) = record.frame() else { continue };
+        let (extended, remote) = (flag(frame.id().is_extended()), flag(frame.is_remote()));
+        assert!(words.len() == 5 && extended.contains(words[1]) && remote.contains(words[2]), "{line}");
+        assert_eq!(words[3..], [frame.dlc().to_string(), frame.id().raw().to_string()], "{line}");
+    }
+    // What it writes has the same packets in blocks of its own making, gzip included.
+    for (name, compress) in [("theirs.pcapng", "none"), ("theirs.pcapng.gz", "gzip")] {
+        let path = theirs.with_file_name(name);
+        let mut command = Command::new("tshark");
+        command.arg("-r").arg(&ours).args(["-F", "pcapng", "-w"]).arg(&theirs);
+        run("tshark", &["--version"], &mut command);
+        if compress == "gzip" {
+            let packed = Command::new("gzip").args(["-kf"]).arg(&theirs).status();
+            assert!(packed.unwrap().success());
+        }
+        let (read, issues) = read(&path);
+        assert_eq!(issues, Vec::<String>::new(), "{name}");
+        assert!(read == records, "{name}: {} of {}", read.len(), records.len());
+    }
+}
+
+/// Times from the first record: can-utils' asc2log takes the date only in one language.
+fn from_start(records: &[TraceRecord]) -> Vec<String> {
+    lines(records, Carries { from_us: records[0].time_ns / 1000, ..EVERYTHING })
+}
+
+#[test]
+fn can_utils_and_we_read_each_others_logs_and_asc_files() {
+    let directory = directory("can_utils");
+    let records = frames_of_every_kind(&directory);
+    let at = |name: &str| directory.join(name);
+    write(&at("ours.log"), Format::Candump, &records);
+    write(&at("ours.asc"), Format::Asc, &records);
+    let mut log2asc = Command::new("log2asc");
+    log2asc.arg("-I").arg(at("ours.log")).arg("-O").arg(at("theirs.asc")).args(["can0", "can1"]);
+    // Neither program knows an option that does nothing: whether it starts is all that can be asked.
+    if run("log2asc (can-utils)", &[], &mut log2asc).is_none() {
+        return;
+    }
+    let mut asc2log = Command::new("asc2log");
+    asc2log.arg("-I").arg(at("ours.asc")).arg("-O").arg(at("theirs.log"));
+    run("asc2log (can-utils)", &[], &mut asc2log);
+    // It prints each line of a log, error frames with what they say.
+    let every = records_of_every_kind(&directory);
+    write(&at("every.log"), Format::Candump, &every);
+    let mut log2long = Command::new("log2long");
+    log2long.stdin(fs::File::open(at("every.log")).unwrap());
+    let text = run("log2long (can-utils)", &[], &mut log2long).unwrap();
+    assert_eq!(text.lines().filter(|line| line.starts_with('(')).count(), every.len(), "{text}");
+    let errors = every.iter().filter(|record| record.frame().is_none()).count();
+    assert_eq!(text.matches("ERRORFRAME").count(), errors, "{text}");
+    for name in ["theirs.asc", "theirs.log"] {
+        let (read, issues) = read(at(name));
+        assert_eq!(issues, Vec::<String>::new(), "{name}");
+        assert_eq!(from_start(&read), from_start(&records), "{name}");
+    }
+}
+
+/// python-can's own test files, from its source distribution, unpacked once.
+fn python_can_test_data() -> Option<PathBuf> {
+    let directory = directory("python_can_sdist");
+    let unpacked = |directory: &Path| {
+        let mut entries = fs::read_dir(directory).unwrap().map(|entry| entry.unwrap().path());
+        entries.find(|path| path.join("test/data").is_dir()).map(|path| path.join("test/data"))
+    };
+    if unpacked(&directory).is_none() {
+        let fetched = Command::new(python())
+            .args([
+                "-m",
+                "pip",
+                "download",
+                "--quiet",
+                "--no-deps",
+                "--no-binary",
+                ":all:",
+                "python-can",
+                "-d",
+            ])
+            .arg(&directory)
+            .output();
+        if !fetched.is_ok_and(|output| output.status.success()) {
+            assert!(!peers_are_required(), "python-can's source is required and could not be fetched");
+            eprintln!("SKIPPED: python-can's source could not be fetched, so its test files were not read");
+            return None;
+        }
+        let archive = fs::read_dir(&directory)
+            .unwrap()
+            .map(|entry| entry.unwrap().path())
+            .find(|path| path.extension().is_some_and(|suffix| suffix == "gz"));
+        let unpack = Command::new("tar").arg("-xzf").arg(archive.unwrap()).current_dir(&directory).status();
+        assert!(unpack.unwrap().success());
+    }
+    unpacked(&directory)
+}
+
+/// Other people's files, cut at a hundred places, give no more than they did and no panic.
+fn cut_everywhere(path: &Path) {
+    let whole = fs::read(path).unwrap();
+    let all = read(path).0.len();
+    let cut_path = directory("python_can_cut").join(path.file_name().unwrap());
+    for cut in (0..whole.len()).step_by(whole.len() / 100 + 1) {
+        fs::write(&cut_path, &whole[..cut]).unwrap();
+        let got = read(&cut_path).0.len();
+        assert!(got <= all, "{} cut at {cut}: {got} of {all}", path.display());
+    }
+}
+
+/// Files of the distribution that the two read differently, and why.
+const DIFFERENT: &[(&str, &str)] = &[
+    (
+        "issue_1299.asc",
+        "a length code of 13 means 8 bytes in a classical frame; python-can takes CAN FD's 32",
+    ),
+    (
+        "logfile.asc",
+        "a remote frame in a CANFD row is a classical one; an error frame is nobody's to have sent",
+    ),
+    ("single_frame.asc", "64 bytes in a classical row are an issue here, a message there"),
+    (
+        "test_CanErrorFrameExt.blf",
+        "channel 4370 is shown as 255, the last; and a microsecond is rounded the other way",
+    ),
+    ("test_CanErrorFrames.asc", "an error frame is nobody's to have sent"),
+    ("test_CanFdRemoteMessage.asc", "a remote frame in a CANFD row is a classical one"),
+    ("test_CanMessage.asc.gz", "the date has PM behind it, which python-can does not read"),
+    ("test_CanMessage.blf", "a mere request to send is no frame on the bus"),
+    ("test_CanMessage2.blf", "a mere request to send is no frame on the bus"),
+    ("test_CanMessage_V1_0_BUS1.trc", "python-can does not read the date of version 1.0"),
+];
+
+#[test]
+fn python_cans_own_test_files_read_the_same() {
+    let Some(data) = python_can_test_data() else { return };
+    let known = ["asc", "blf", "trc", "gz"];
+    let mut paths: Vec<_> = fs::read_dir(data)
+        .unwrap()
+        .map(|entry| entry.unwrap().path())
+        .filter(|path| path.extension().is_some_and(|suffix| known.iter().any(|known| suffix == *known)))
+        .collect();
+    paths.sort();
+    assert!(paths.len() >= 20, "{paths:?}");
+    let Some(theirs) = python_can_reads(&paths) else { return };
+    let mut differences = Vec::new();
+    for path in &paths {
+        let name = path.file_name().unwrap().to_str().unwrap();
+        // A frame of CAN FD is an issue here and a message there.
+        let theirs: Vec<_> = theirs[path].iter().filter(|line| !line.contains(" fd ")).cloned().collect();
+        let ours = lines(&read(path).0, EVERYTHING);
+        if ours != theirs {
+            differences.push((name.to_owned(), ours, theirs));
+        }
+    }
+    for path in &paths {
+        cut_everywhere(path);
+    }
+    let names: Vec<_> = differences.iter().map(|(name, ..)| name.as_str()).collect();
+    let expected: Vec<_> = DIFFERENT.iter().map(|(name, _)| *name).collect();
+    assert_eq!(names, expected, "{differences:#?}");
+}

@@ -1,0 +1,91 @@
+//! What is wrong with a condition, with a mark under the place.
+
+use std::fmt;
+
+use crate::Suggestion;
+
+/// Why a text is no condition.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ConditionError {
+    /// The condition.
+    pub text: String,
+    /// Where it is wrong, in bytes.
+    pub at: usize,
+    /// What is wrong.
+    pub fault: ConditionFault,
+}
+
+/// What is wrong.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ConditionFault {
+    /// Something else should stand here.
+    #[error("expected {expected}, found {found}")]
+    Unexpected {
+        /// What should.
+        expected: &'static str,
+        /// What does.
+        found: String,
+    },
+    /// A character that no part of a condition starts with.
+    #[error("{0:?} has no meaning here")]
+    Character(char),
+    /// The closing quote is missing.
+    #[error("this text has no closing quote")]
+    OpenText,
+    /// Not a number.
+    #[error("{0:?} is no number")]
+    Number(String),
+    /// `a < b < c`.
+    #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
+    Chained,
+    /// No place of a data byte.
+    #[error("a frame has no byte {0}; bytes are counted from 0 to 7")]
+    ByteIndex(String),
+    /// A name of nothing.
+    #[error("there is no signal {name:?}{near}")]
+    UnknownName {
+        /// The name.
+        name: String,
+        /// A name like it.
+        near: Suggestion,
+    },
+    /// A name of nothing, because nothing was loaded.
+    #[error("{0:?} is no part of a frame, and without a database there are no signals")]
+    NoDatabase(String),
+    /// A text where it cannot be compared.
+    #[error("a text can only be compared with a signal, by == or !=")]
+    LoneText,
+    /// A text that the signal does not have.
+    #[error("{signal} has no value {text:?}{choices}")]
+    UnknownText {
+        /// The signal.
+        signal: String,
+        /// The text.
+        text: String,
+        /// The texts it has, ready to be printed.
+        choices: String,
+    },
+    /// Too long.
+    #[error("a condition may have {0} characters at most")]
+    TooLong(usize),
+    /// Too many parentheses.
+    #[error("parentheses are nested deeper than {0}")]
+    TooDeep(usize),
+}
+
+impl fmt::Display for ConditionError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let before = self.text.get(..self.at).unwrap_or(&self.text);
+        writeln!(f, "{}", self.fault)?;
+        // A condition can come from a file with line ends and tabs: one line, one column each.
+        writeln!(f, "  {}", self.text.replace(char::is_control, " "))?;
+        write!(f, "  {}^", " ".repeat(before.chars().count()))
+    }
+}
+
+impl std::error::Error for ConditionError {
+    fn source(&self) -> Option<&(dyn std::error::Error + 'static)> {
+        Some(&self.fault)
+    }
+}

@@ -1,0 +1,395 @@
+//! What a database says: messages, signals, and how their bits become values.
+
+use std::fmt;
+use std::ops::RangeInclusive;
+use std::str::FromStr;
+
+use cantap_wire::Id;
+
+use super::fault::Fault;
+use super::layout::{self, ByteOrder};
+use super::number::Number;
+
+/// A set of messages, from one file.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Database {
+    /// The file it was read from, for messages to the user.
+    pub file: String,
+    /// The messages, in the file's order.
+    pub messages: Vec<Message>,
+    /// What is wrong with the file although it can be used.
+    pub warnings: Vec<Fault>,
+}
+
+/// One kind of frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Message {
+    /// The identifier it is sent with.
+    pub id: Id,
+    /// Its name.
+    pub name: String,
+    /// What it is for; may be empty.
+    pub description: String,
+    /// Its length in bytes. Above eight it is a message of CAN FD or of a transport protocol.
+    pub length: u16,
+    /// How often it is sent, in milliseconds, if that is known.
+    pub cycle_ms: Option<u32>,
+    /// Whether it is a J1939 parameter group: priority and source address do not matter in a match.
+    pub j1939: bool,
+    /// Its signals, in the file's order.
+    pub signals: Vec<Signal>,
+    /// The line in the file, from 1; 0 if there is none.
+    pub line: u32,
+}
+
+impl Message {
+    /// The signal of that name.
+    pub fn signal(&self, name: &str) -> Option<&Signal> {
+        self.signals.iter().find(|signal| signal.name == name)
+    }
+}
+
+/// One value inside a message.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Signal {
+    /// Its name.
+    pub name: String,
+    /// What it means; may be empty.
+    pub description: String,
+    /// Its unit, such as `km/h`; may be empty.
+    pub unit: String,
+    /// The first bit in DBC's numbering: the least significant bit of a little-endian signal, the
+    /// most significant of a big-endian one. Bit 0 is the least significant of the first byte.
+    pub start: u16,
+    /// Number of bits, 1 to 64.
+    pub length: u16,
+    /// In which order its bytes follow.
+    pub order: ByteOrder,
+    /// What its bits are.
+    pub kind: ValueKind,
+    /// Physical value = raw value · factor + offset.
+    pub factor: f64,
+    /// Physical value = raw value · factor + offset.
+    pub offset: f64,
+    /// The smallest physical value the file allows, if it says.
+    pub min: Option<f64>,
+    /// The largest physical value the file allows, if it says.
+    pub max: Option<f64>,
+    /// Texts for raw values.
+    pub values: ValueTable,
+    /// When the signal is there, if not always.
+    pub multiplexed: Option<Multiplexed>,
+    /// Whether other signals depend on its value.
+    pub is_switch: bool,
+    /// The raw value to send where the user gives none.
+    pub initial_raw: u64,
+    /// How to show it as on and off, if it is to be.
+    pub digital: Option<Digital>,
+    /// Limits beyond which it is shown as an alarm.
+    pub alarms: Alarms,
+    /// The colour to draw it with.
+    pub colour: Option<Colour>,
+    /// The line in the file, from 1; 0 if there is none.
+    pub line: u32,
+}
+
+/// What a signal's bits are.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ValueKind {
+    /// An integer without sign.
+    Unsigned,
+    /// An integer in two's complement.
+    Signed,
+    /// A sign bit, then the magnitude: 0xC040 in 16 bits is −0x4040.
+    SignMagnitude,
+    /// IEEE 754 half precision, 16 bits.
+    Half,
+    /// IEEE 754 single precision. Fewer than 32 bits are its upper bits, the rest being zero.
+    Single,
+    /// IEEE 754 double precision. Fewer than 64 bits are its upper bits, the rest being zero.
+    Double,
+}
+
+/// Under which values of another signal a signal is there.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Multiplexed {
+    /// The other signal's index in [`Message::signals`].
+    pub switch: usize,
+    /// Its raw values, in the file's order.
+    pub values: Vec<RangeInclusive<u64>>,
+}
+
+impl Multiplexed {
+    /// Whether the signal is there when the switch has this raw value.
+    pub fn matches(&self, raw: u64) -> bool {
+        self.values.iter().any(|range| range.contains(&raw))
+    }
+}
+
+/// A signal with two states: on from `high` upwards, off from `low` downwards, in between as before.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Digital {
+    /// Off at this physical value and below.
+    pub low: f64,
+    /// On at this physical value and above.
+    pub high: f64,
+}
+
+impl Digital {
+    /// The state after `value`, from the state before it.
+    pub fn state(self, before: bool, value: f64) -> bool {
+        if value >= self.high { true } else { before && value > self.low }
+    }
+}
+
+/// Limits of a signal's normal values.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Alarms {
+    /// Below this physical value it is an alarm.
+    pub min: Option<f64>,
+    /// Above this physical value it is an alarm.
+    pub max: Option<f64>,
+}
+
+/// Which limit a value has left.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Alarm {
+    /// Below [`Alarms::min`]; shown blue.
+    Below,
+    /// Above [`Alarms::max`]; shown red.
+    Above,
+}
+
+impl Alarms {
+    /// The alarm that this physical value raises, if it does.
+    pub fn check(self, value: f64) -> Option<Alarm> {
+        if self.max.is_some_and(|max| value > max) {
+            Some(Alarm::Above)
+        } else if self.min.is_some_and(|min| value < min) {
+            Some(Alarm::Below)
+        } else {
+            None
+        }
+    }
+}
+
+/// A colour, written `#RRGGBB`.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Colour {
+    /// 0 to 255.
+    pub red: u8,
+    /// 0 to 255.
+    pub green: u8,
+    /// 0 to 255.
+    pub blue: u8,
+}
+
+impl FromStr for Colour {
+    type Err = &'static str;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let digits = text.strip_prefix('#').filter(|digits| digits.len() == 6);
+        let digits = digits.filter(|digits| digits.bytes().all(|byte| byte.is_ascii_hexdigit()));
+        let number = digits.and_then(|digits| u32::from_str_radix(digits, 16).ok());
+        let [_, red, green, blue] = number.ok_or("write a colour as \"#RRGGBB\"")?.to_be_bytes();
+        Ok(Self { red, green, blue })
+    }
+}
+
+impl fmt::Display for Colour {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "#{:02X}{:02X}{:02X}", self.red, self.green, self.blue)
+    }
+}
+
+/// Texts for raw values, such as 3 = "Drive".
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct ValueTable {
+    /// Sorted by value, each once.
+    entries: Vec<(i64, String)>,
+}
+
+impl ValueTable {
+    /// Makes a table; where a value occurs twice the last text counts.
+    pub fn new(entries: impl IntoIterator<Item = (i64, String)>) -> Self {
+        let by_value: std::collections::BTreeMap<_, _> = entries.into_iter().collect();
+        Self { entries: by_value.into_iter().collect() }
+    }
+
+    /// The text for a raw value.
+    pub fn text(&self, raw: i64) -> Option<&str> {
+        let found = self.entries.binary_search_by_key(&raw, |&(value, _)| value).ok()?;
+        Some(&self.entries[found].1)
+    }
+
+    /// The raw value for a text: as written, else without regard to case.
+    pub fn value(&self, text: &str) -> Option<i64> {
+        let find = |same: fn(&str, &str) -> bool| self.entries.iter().find(|(_, entry)| same(entry, text));
+        let entry = find(|a, b| a == b).or_else(|| find(str::eq_ignore_ascii_case))?;
+        Some(entry.0)
+    }
+
+    /// All values with their texts, by value.
+    pub fn iter(&self) -> impl Iterator<Item = (i64, &str)> {
+        self.entries.iter().map(|(value, text)| (*value, text.as_str()))
+    }
+
+    /// Whether there are no texts.
+    pub fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+}
+
+impl Signal {
+    /// An unsigned little-endian signal with factor 1 and nothing else said.
+    pub fn new(name: impl Into<String>, start: u16, length: u16) -> Self {
+        Self {
+            name: name.into(),
+            description: String::new(),
+            unit: String::new(),
+            start,
+            length,
+            order: ByteOrder::Little,
+            kind: ValueKind::Unsigned,
+            factor: 1.0,
+            offset: 0.0,
+            min: None,
+            max: None,
+            values: ValueTable::default(),
+            multiplexed: None,
+            is_switch: false,
+            initial_raw: 0,
+            digital: None,
+            alarms: Alarms::default(),
+            colour: None,
+            line: 0,
+        }
+    }
+
+    /// How many data bytes a frame must have to hold it.
+    pub fn bytes_needed(&self) -> u32 {
+        layout::bytes_needed(self.order, self.start, self.length)
+    }
+
+    /// The signal's bits from a message's data; `None` if the data is too short.
+    pub fn extract(&self, data: &[u8]) -> Option<u64> {
+        layout::extract(self.order, self.start, self.length, data)
+    }
+
+    /// The raw bits as an integer, for the integer kinds.
+    pub fn integer(&self, raw: u64) -> Option<i128> {
+        let unused = 64 - u32::from(self.length);
+        match self.kind {
+            ValueKind::Unsigned => Some(raw.into()),
+            ValueKind::Signed => Some(i128::from((raw << unused) as i64 >> unused)),
+            ValueKind::SignMagnitude => {
+                let magnitude = i128::from(raw & layout::mask(self.length) >> 1);
+                Some(if raw >> (self.length - 1) & 1 == 1 { -magnitude } else { magnitude })
+            }
+            ValueKind::Half | ValueKind::Single | ValueKind::Double => None,
+        }
+    }
+
+    /// The raw bits as a float, before factor and offset.
+    pub(super) fn raw_to_f64(&self, raw: u64) -> f64 {
+        let length = u32::from(self.length);
+        match self.kind {
+            ValueKind::Unsigned => raw as f64,
+            ValueKind::Signed | ValueKind::SignMagnitude => {
+                self.integer(raw).map_or(f64::NAN, |value| value as f64)
+            }
+            ValueKind::Half => half::f16::from_bits(raw as u16).to_f64(),
+            ValueKind::Single => f32::from_bits((raw as u32) << (32 - length.min(32))).into(),
+            ValueKind::Double => f64::from_bits(raw << (64 - length)),
+        }
+    }
+
+    /// The physical value of the raw bits, as a float.
+    pub fn physical(&self, raw: u64) -> f64 {
+        self.raw_to_f64(raw) * self.factor + self.offset
+    }
+
+    /// The physical value of the raw bits, exact where it is an integer.
+    pub fn number(&self, raw: u64) -> Number {
+        match self.integer(raw) {
+            Some(integer) if is_integer(self.factor) && is_integer(self.offset) => {
+                Number::Integer(integer * self.factor as i128 + self.offset as i128)
+            }
+            _ => Number::Real(self.physical(raw)),
+        }
+    }
+
+    /// What the value table knows the raw bits by: the integer they are, before factor and offset.
+    pub fn table_key(&self, raw: u64) -> Option<i64> {
+        let value = self.integer(raw).or_else(|| {
+            let value = self.raw_to_f64(raw);
+            is_integer(value).then_some(value as i128)
+        });
+        i64::try_from(value?).ok()
+    }
+
+    /// The text that the value table has for the raw bits.
+    pub fn text(&self, raw: u64) -> Option<&str> {
+        if self.values.is_empty() {
+            return None;
+        }
+        self.values.text(self.table_key(raw)?)
+    }
+}
+
+/// Whether a float is an integer that it can hold exactly beside its neighbours.
+fn is_integer(value: f64) -> bool {
+    value.fract() == 0.0 && value.abs() <= (1u64 << 53) as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The "Signed" of the earlier analyser.
+    #[test]
+    fn sign_magnitude_has_its_sign_in_the_first_bit() {
+        let signal = Signal { kind: ValueKind::SignMagnitude, ..Signal::new("S", 0, 16) };
+        assert_eq!(signal.number(0xC040), Number::Integer(-0x4040));
+        assert_eq!(signal.number(0x4040), Number::Integer(0x4040));
+    }
+
+    /// The "Float" of the earlier analyser: fewer bits are the upper ones.
+    #[test]
+    fn floats_are_left_aligned() {
+        let upper = Signal { kind: ValueKind::Single, ..Signal::new("F", 0, 16) };
+        assert_eq!(upper.number(0xBFC0), Number::Real(-1.5));
+        let whole = Signal { kind: ValueKind::Single, ..Signal::new("F", 0, 32) };
+        assert_eq!(whole.number(0xBFC0_0000), Number::Real(-1.5));
+        let double = Signal { kind: ValueKind::Double, ..Signal::new("D", 0, 24) };
+        assert_eq!(double.number(0xBF_F800), Number::Real(-1.5));
+    }
+
+    #[test]
+    fn sixty_four_bits_stay_exact() {
+        let unsigned = Signal::new("U", 0, 64);
+        assert_eq!(unsigned.number(u64::MAX), Number::Integer(u64::MAX.into()));
+        let signed =
+            Signal { kind: ValueKind::Signed, factor: 10.0, offset: -1.0, ..Signal::new("S", 0, 64) };
+        assert_eq!(signed.number(1 << 63), Number::Integer(i128::from(i64::MIN) * 10 - 1));
+    }
+
+    #[test]
+    fn a_digital_signal_keeps_its_state_between_the_thresholds() {
+        let digital = Digital { low: 1.0, high: 3.0 };
+        let mut state = false;
+        let states = [0.0, 2.0, 3.0, 2.0, 1.0, 2.0].map(|value| {
+            state = digital.state(state, value);
+            state
+        });
+        assert_eq!(states, [false, false, true, true, false, false]);
+    }
+
+    #[test]
+    fn colours_are_six_digits() {
+        assert_eq!("#ff8800".parse::<Colour>().unwrap().to_string(), "#FF8800");
+        for bad in ["ff8800", "#ff880", "#ff88zz", "#+f8800", "#ff88é"] {
+            assert!(bad.parse::<Colour>().is_err(), "{bad}");
+        }
+    }
+}

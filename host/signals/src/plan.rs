@@ -1,0 +1,199 @@
+//! A message compiled for decoding: per signal one shift, one mask and one multiplication.
+//!
+//! Frames carry at most eight bytes, so the data is loaded twice into a register, once per byte
+//! order, and every signal is cut out of the one that suits it. Signals under the same multiplexer
+//! values form a group whose condition is tested once.
+
+use std::ops::RangeInclusive;
+
+use super::fault::MAX_SWITCHES;
+use super::layout;
+use super::layout::ByteOrder;
+use super::model::{Message, Signal, ValueKind};
+
+/// One decoded signal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct SignalValue {
+    /// The signal's index in [`Message::signals`].
+    pub signal: u32,
+    /// Its bits.
+    pub raw: u64,
+    /// Its physical value. [`Signal::number`] gives it exactly where 53 bits are not enough.
+    pub value: f64,
+}
+
+/// How to decode one message.
+#[derive(Clone, Debug)]
+pub struct MessagePlan {
+    groups: Vec<Group>,
+}
+
+#[derive(Clone, Debug)]
+struct Group {
+    /// All must hold; none for signals that are always there.
+    conditions: Vec<Condition>,
+    signals: Vec<SignalPlan>,
+}
+
+#[derive(Clone, Debug, PartialEq)]
+struct Condition {
+    switch: Field,
+    values: Vec<RangeInclusive<u64>>,
+}
+
+/// Where the bits are.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Field {
+    order: ByteOrder,
+    /// For data of up to eight bytes: right shift of the register.
+    shift: u8,
+    /// Fewest data bytes; 255 if no frame has enough.
+    needed: u8,
+    mask: u64,
+    /// For longer data.
+    start: u16,
+    length: u16,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct SignalPlan {
+    field: Field,
+    conversion: Conversion,
+    index: u32,
+    factor: f64,
+    offset: f64,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Conversion {
+    Unsigned,
+    /// Shift left and arithmetically right by this.
+    Signed(u8),
+    /// Left shift that aligns a single-precision float.
+    Single(u8),
+    /// Left shift that aligns a double-precision float.
+    Double(u8),
+    /// Too rare to be fast.
+    Other,
+}
+
+/// Data as the decoder reads it.
+#[derive(Clone, Copy)]
+enum Payload<'a> {
+    /// Up to eight bytes, in both orders.
+    Frame { little: u64, big: u64, len: u8 },
+    /// A reassembled message.
+    Long(&'a [u8]),
+}
+
+impl Field {
+    /// `None` for signals that no database from a file has: without bits, or with too many.
+    fn of(signal: &Signal) -> Option<Self> {
+        let (order, start, length) = (signal.order, signal.start, signal.length);
+        if !(1..=64).contains(&length) {
+            return None;
+        }
+        let needed = signal.bytes_needed();
+        let shift = match order {
+            _ if needed > 8 => 0,
+            ByteOrder::Little => start as u8,
+            ByteOrder::Big => (64 - layout::wire_position(start.into()) - u32::from(length)) as u8,
+        };
+        let needed = if needed > 8 { u8::MAX } else { needed as u8 };
+        Some(Self { order, shift, needed, mask: layout::mask(length), start, length })
+    }
+
+    fn extract(&self, payload: Payload) -> Option<u64> {
+        match payload {
+            Payload::Frame { little, big, len } => {
+                if self.needed > len {
+                    return None;
+                }
+                let word = if self.order == ByteOrder::Big { big } else { little };
+                Some(word >> self.shift & self.mask)
+            }
+            Payload::Long(data) => layout::extract(self.order, self.start, self.length, data),
+        }
+    }
+}
+
+impl MessagePlan {
+    /// Compiles those signals of `message` that `wanted` accepts.
+    pub fn new(message: &Message, wanted: impl Fn(usize, &Signal) -> bool) -> Self {
+        let mut groups: Vec<Group> = Vec::new();
+        for (index, signal) in message.signals.iter().enumerate() {
+            let (Some(field), true) = (Field::of(signal), wanted(index, signal)) else { continue };
+            let Some(conditions) = conditions(&message.signals, signal) else { continue };
+            let unused = 64 - signal.length as u8;
+            let conversion = match signal.kind {
+                ValueKind::Unsigned => Conversion::Unsigned,
+                ValueKind::Signed => Conversion::Signed(unused),
+                ValueKind::Single if signal.length <= 32 => Conversion::Single(unused - 32),
+                ValueKind::Double => Conversion::Double(unused),
+                ValueKind::Half | ValueKind::Single | ValueKind::SignMagnitude => Conversion::Other,
+            };
+            let (factor, offset) = (signal.factor, signal.offset);
+            let plan = SignalPlan { field, conversion, index: index as u32, factor, offset };
+            match groups.iter_mut().find(|group| group.conditions == conditions) {
+                Some(group) => group.signals.push(plan),
+                None => groups.push(Group { conditions, signals: vec![plan] }),
+            }
+        }
+        Self { groups }
+    }
+
+    /// Whether there is nothing to decode.
+    pub fn is_empty(&self) -> bool {
+        self.groups.is_empty()
+    }
+
+    /// Appends every signal that is there and fits `data`.
+    pub fn decode(&self, message: &Message, data: &[u8], values: &mut Vec<SignalValue>) {
+        let payload = if data.len() <= 8 {
+            let mut padded = [0; 8];
+            padded[..data.len()].copy_from_slice(data);
+            let (little, big) = (u64::from_le_bytes(padded), u64::from_be_bytes(padded));
+            Payload::Frame { little, big, len: data.len() as u8 }
+        } else {
+            Payload::Long(data)
+        };
+        for group in &self.groups {
+            let there = group.conditions.iter().all(|condition| {
+                let switch = condition.switch.extract(payload);
+                switch.is_some_and(|raw| condition.values.iter().any(|range| range.contains(&raw)))
+            });
+            if there {
+                values.extend(group.signals.iter().filter_map(|plan| plan.decode(message, payload)));
+            }
+        }
+    }
+}
+
+impl SignalPlan {
+    #[inline]
+    fn decode(&self, message: &Message, payload: Payload) -> Option<SignalValue> {
+        let raw = self.field.extract(payload)?;
+        let unscaled = match self.conversion {
+            Conversion::Unsigned => raw as f64,
+            Conversion::Signed(unused) => ((raw << unused) as i64 >> unused) as f64,
+            Conversion::Single(left) => f32::from_bits((raw as u32) << left).into(),
+            Conversion::Double(left) => f64::from_bits(raw << left),
+            Conversion::Other => message.signals[self.index as usize].raw_to_f64(raw),
+        };
+        Some(SignalValue { signal: self.index, raw, value: unscaled * self.factor + self.offset })
+    }
+}
+
+/// All that must hold for the signal to be there, the outermost multiplexer last; `None` if it
+/// never is.
+fn conditions(signals: &[Signal], signal: &Signal) -> Option<Vec<Condition>> {
+    let mut conditions = Vec::new();
+    let mut at = signal;
+    while let Some(multiplexed) = &at.multiplexed {
+        // Files are checked for circles; a database made by a program may have one.
+        let switch = signals.get(multiplexed.switch).filter(|_| conditions.len() < MAX_SWITCHES)?;
+        conditions.push(Condition { switch: Field::of(switch)?, values: multiplexed.values.clone() });
+        at = switch;
+    }
+    Some(conditions)
+}

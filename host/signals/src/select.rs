@@ -1,0 +1,108 @@
+//! Choosing signals by patterns such as `Engine.*` or `*Temp`.
+
+use std::fmt;
+
+use glob::Pattern;
+
+use super::model::{Message, Signal};
+
+/// Patterns of signals; without any, all signals are chosen.
+///
+/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name.
+/// `*` is any text, `?` one character, `[a-z]` one of several. Upper and lower case differ.
+#[derive(Clone, Debug, Default)]
+pub struct Selection {
+    patterns: Vec<Pattern>,
+}
+
+/// Why a pattern is of no use.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum SelectionError {
+    /// It is not well formed.
+    #[error("pattern {pattern:?}: {source}; use *, ? and [a-z]")]
+    Malformed {
+        /// The pattern.
+        pattern: String,
+        /// What is wrong with it.
+        source: glob::PatternError,
+    },
+    /// No signal has such a name.
+    #[error("no signal of the databases matches {pattern:?}{near}")]
+    NoMatch {
+        /// The pattern.
+        pattern: String,
+        /// A name that it may have meant.
+        near: Suggestion,
+    },
+}
+
+impl Selection {
+    /// Compiles patterns.
+    pub fn new<T: AsRef<str>>(patterns: &[T]) -> Result<Self, SelectionError> {
+        let compile = |pattern: &T| {
+            let pattern = pattern.as_ref();
+            Pattern::new(pattern)
+                .map_err(|source| SelectionError::Malformed { pattern: pattern.to_owned(), source })
+        };
+        Ok(Self { patterns: patterns.iter().map(compile).collect::<Result<_, _>>()? })
+    }
+
+    /// Whether the signal is chosen.
+    pub fn matches(&self, message: &Message, signal: &Signal) -> bool {
+        self.patterns.is_empty() || self.patterns.iter().any(|pattern| matches(pattern, message, signal))
+    }
+
+    /// Fails if one of the patterns chooses nothing of these messages: most likely a slip of the pen.
+    pub fn check<'a>(
+        &self,
+        messages: &(impl Iterator<Item = &'a Message> + Clone),
+    ) -> Result<(), SelectionError> {
+        for pattern in &self.patterns {
+            let found = messages
+                .clone()
+                .any(|message| message.signals.iter().any(|signal| matches(pattern, message, signal)));
+            if !found {
+                let names =
+                    messages.clone().flat_map(|message| message.signals.iter().map(|s| s.name.as_str()));
+                let near = Suggestion::nearest(pattern.as_str(), names);
+                return Err(SelectionError::NoMatch { pattern: pattern.as_str().to_owned(), near });
+            }
+        }
+        Ok(())
+    }
+}
+
+fn matches(pattern: &Pattern, message: &Message, signal: &Signal) -> bool {
+    if pattern.as_str().contains('.') {
+        pattern.matches(&format!("{}.{}", message.name, signal.name))
+    } else {
+        pattern.matches(&signal.name)
+    }
+}
+
+/// The end of a message about a name that is not there: the name that may have been meant, if one
+/// is like it.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Suggestion(Option<String>);
+
+impl Suggestion {
+    /// Looks for the name most like `wanted`.
+    pub fn nearest<'a>(wanted: &str, names: impl Iterator<Item = &'a str>) -> Self {
+        /// Below this, suggestions are worse than none.
+        const LIKE: f64 = 0.7;
+        let wanted = wanted.to_lowercase();
+        let scored = names.map(|name| (strsim::jaro_winkler(&wanted, &name.to_lowercase()), name));
+        let best = scored.max_by(|(a, _), (b, _)| a.total_cmp(b)).filter(|&(like, _)| like >= LIKE);
+        Self(best.map(|(_, name)| name.to_owned()))
+    }
+}
+
+impl fmt::Display for Suggestion {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match &self.0 {
+            Some(name) => write!(f, "; did you mean {name}?"),
+            None => Ok(()),
+        }
+    }
+}

@@ -1,0 +1,230 @@
+//! Decoding agrees with cantools: the same signals with the same values, for 100 random payloads per
+//! message of every database in `tests/data` and of cantools' own test databases.
+//!
+//! Needs a Python with cantools (`CANTAP_PYTHON`, else `python3`). Without it the test says so and
+//! passes, unless `CANTAP_REQUIRE_PEERS=1`.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+use cantap_signals::{Decoder, Number, Source};
+use cantap_trace::Id;
+use serde::Deserialize;
+
+const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/cantools_peer.py");
+
+/// Databases that one side refuses, and why.
+const REFUSED: &[(&str, &str)] = &[
+    (
+        "incorrect-sig_valtype.dbc",
+        "a SIG_VALTYPE_ for an unknown signal is a warning here: nothing decodes wrong for it",
+    ),
+    ("incorrect-val.dbc", "a VAL_ for an unknown signal is a warning here: nothing decodes wrong for it"),
+];
+
+/// Messages that decode differently, and why.
+const DIFFERENT: &[(&str, &str, &str)] = &[
+    (
+        "bad_message_length.dbc",
+        "Message1",
+        "the signal ends beyond its message: cantools decodes nothing, here it is left out",
+    ),
+    (
+        "issue_63.dbc",
+        "AFT1PSI2",
+        "two signals overlap: cantools decodes nothing, here each is read where it stands",
+    ),
+];
+
+/// One line of the script's output.
+#[derive(Debug, Deserialize)]
+struct Line {
+    file: Option<PathBuf>,
+    refused: Option<String>,
+    messages: Option<usize>,
+    #[serde(default)]
+    message: String,
+    #[serde(default)]
+    id: u32,
+    #[serde(default)]
+    extended: bool,
+    #[serde(default)]
+    data: String,
+    signals: Option<BTreeMap<String, String>>,
+    #[serde(default)]
+    texts: BTreeMap<String, String>,
+    failed: Option<String>,
+}
+
+fn peer(arguments: &[&Path]) -> Result<String, String> {
+    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let output = Command::new(&python).arg(SCRIPT).args(arguments).output();
+    match output {
+        Ok(Output { status, stdout, .. }) if status.success() => {
+            Ok(String::from_utf8(stdout).expect("the script prints UTF-8"))
+        }
+        Ok(output) => Err(String::from_utf8_lossy(&output.stderr).into_owned()),
+        Err(error) => Err(format!("{python}: {error}")),
+    }
+}
+
+/// The script's output, or `None` after saying that the peer is missing.
+fn peer_or_skip(arguments: &[&Path]) -> Option<String> {
+    match peer(arguments) {
+        Ok(text) => Some(text),
+        Err(reason) if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") => {
+            panic!("cantools is required and does not run: {reason}")
+        }
+        Err(reason) => {
+            eprintln!("SKIPPED: no comparison with cantools: {reason}");
+            None
+        }
+    }
+}
+
+fn own_files() -> Vec<PathBuf> {
+    let directory = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data/dbc");
+    let entries = directory.read_dir().unwrap().map(|entry| entry.unwrap().path());
+    let mut files: Vec<_> =
+        entries.filter(|path| path.extension().is_some_and(|suffix| suffix == "dbc")).collect();
+    files.sort();
+    files
+}
+
+/// The very same number, not one near it.
+#[expect(clippy::float_cmp, reason = "both sides compute the same operations on the same bits")]
+fn equal(theirs: &str, ours: Number) -> bool {
+    match (theirs.parse::<i128>(), ours) {
+        (Ok(theirs), Number::Integer(ours)) => theirs == ours,
+        (Ok(theirs), Number::Real(ours)) => theirs as f64 == ours,
+        (Err(_), ours) => {
+            let (theirs, ours) = (theirs.parse::<f64>().unwrap(), ours.as_f64());
+            theirs == ours || theirs.is_nan() && ours.is_nan()
+        }
+    }
+}
+
+fn bytes(hex: &str) -> Vec<u8> {
+    (0..hex.len() / 2).map(|at| u8::from_str_radix(&hex[2 * at..2 * at + 2], 16).unwrap()).collect()
+}
+
+/// What differs for one payload.
+fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
+    let id = if line.extended { Id::extended(line.id) } else { Id::standard(line.id) }.unwrap();
+    let Some(reference) = decoder.find(1, id) else { return vec!["no such message here".to_owned()] };
+    let message = decoder.message(reference);
+    let mut values = Vec::new();
+    decoder.decode_data(reference, &bytes(&line.data), &mut values);
+    let (mut ours, mut texts) = (BTreeMap::new(), BTreeMap::new());
+    for value in &values {
+        let signal = &message.signals[value.signal as usize];
+        let number = signal.number(value.raw);
+        let same = equal(&format!("{:?}", value.value), number);
+        assert!(
+            same || matches!(number, Number::Integer(n) if n.abs() > 1 << 53),
+            "{number} is not {value:?}"
+        );
+        ours.insert(signal.name.as_str(), number);
+        if let Some(text) = signal.text(value.raw) {
+            texts.insert(signal.name.clone(), text.to_owned());
+        }
+    }
+    let mut found = Vec::new();
+    if texts != line.texts {
+        found.push(format!("texts: theirs {:?}, ours {texts:?}", line.texts));
+    }
+    if message.name != line.message {
+        found.push(format!("the name is {} here", message.name));
+    }
+    let theirs = match (&line.signals, &line.failed) {
+        (Some(signals), _) => signals,
+        (None, failed) => return vec![format!("cantools fails: {}", failed.as_deref().unwrap_or_default())],
+    };
+    for (name, theirs) in theirs {
+        match ours.remove(name.as_str()) {
+            None => found.push(format!("{name} is missing here")),
+            Some(ours) if !equal(theirs, ours) => found.push(format!("{name}: theirs {theirs}, ours {ours}")),
+            Some(_) => {}
+        }
+    }
+    found.extend(ours.keys().map(|name| format!("{name} is only here")));
+    found
+}
+
+/// Compares all files; returns every difference that is not listed, and how much was compared.
+fn compare(files: &[PathBuf]) -> Option<(Vec<String>, usize, usize)> {
+    let mut arguments = vec![Path::new("decode")];
+    arguments.extend(files.iter().map(PathBuf::as_path));
+    let output = peer_or_skip(&arguments)?;
+    let (mut unexpected, mut databases, mut payloads) = (Vec::new(), 0, 0);
+    let mut current: Option<(String, Decoder)> = None;
+    for text in output.lines() {
+        let line: Line = serde_json::from_str(text).expect("the script prints JSON");
+        if let Some(path) = &line.file {
+            let name = path.file_name().unwrap().to_string_lossy().into_owned();
+            let ours = cantap_signals::load(path);
+            current = None;
+            match (&line.refused, ours) {
+                (None, Ok(database)) => {
+                    databases += 1;
+                    if line.messages != Some(database.messages.len()) {
+                        unexpected.push(format!(
+                            "{name}: {} messages here, {:?} there",
+                            database.messages.len(),
+                            line.messages
+                        ));
+                    }
+                    current = Some((name, Decoder::new(vec![Source { channel: None, database }])));
+                }
+                (Some(_), Err(_)) => {}
+                (theirs, ours) => {
+                    if !REFUSED.iter().any(|&(file, _)| file == name) {
+                        unexpected.push(format!(
+                            "{name}: theirs {theirs:?}, ours {:?}",
+                            ours.err().map(|e| e.to_string())
+                        ));
+                    }
+                }
+            }
+        } else if let Some((name, decoder)) = &current {
+            payloads += 1;
+            if DIFFERENT.iter().any(|&(file, message, _)| file == *name && message == line.message) {
+                continue;
+            }
+            let found = differences(decoder, &line);
+            // The first payload that shows a message's difference is enough to read.
+            let difference =
+                found.first().map(|found| format!("{name}: {}: {found} (data {})", line.message, line.data));
+            let known = |text: &String| text.starts_with(&format!("{name}: {}: ", line.message));
+            unexpected.extend(difference.filter(|_| !unexpected.iter().any(known)));
+        }
+    }
+    Some((unexpected, databases, payloads))
+}
+
+fn assert_none((unexpected, databases, payloads): (Vec<String>, usize, usize)) {
+    let shown = unexpected.join("\n");
+    assert!(unexpected.is_empty(), "{databases} databases, {payloads} payloads, these differ:\n{shown}");
+    println!("{databases} databases, {payloads} payloads, no difference that is not listed");
+}
+
+#[test]
+fn our_test_databases_decode_as_with_cantools() {
+    if let Some(result) = compare(&own_files()) {
+        assert!(result.1 == own_files().len() && result.2 > 20_000);
+        assert_none(result);
+    }
+}
+
+#[test]
+fn cantools_own_test_databases_decode_as_with_cantools() {
+    let cache = Path::new(env!("CARGO_TARGET_TMPDIR")).join("cantools");
+    std::fs::create_dir_all(&cache).unwrap();
+    let Some(list) = peer_or_skip(&[Path::new("files"), &cache]) else { return };
+    let files: Vec<PathBuf> = list.lines().map(PathBuf::from).collect();
+    assert!(files.len() > 80, "{files:?}");
+    if let Some(result) = compare(&files) {
+        assert_none(result);
+    }
+}

@@ -1,0 +1,250 @@
+//! Device time to UTC.
+//!
+//! The host asks for the device's time now and then, and lays a line through the round trips ([`corridor`]). What
+//! it measures the device's time with in between is a ruler: the frames of the USB host controller where the device marks them
+//! ([`FrameClock`]), else the device's own crystal. Neither of them is UTC. But crystals wander by some parts per million
+//! with temperature, so that a line over the device's ticks is straight for a minute or so; the frames show every wandering of the device
+//! against the controller. Where the computer's clock runs by the same crystal as its controller, or one as steady, the line against the
+//! frames is straight for many minutes, and ten minutes of round trips say where it is.
+//!
+//! An operating system does not tell programs which frame it is. So what the frames are in UTC comes from the round trips, too, and what these
+//! cannot say, frames do not either: whether the way there takes as long as the way back.
+//!
+//! Records are mapped by a line that bends at every round trip and never runs backwards: it meets the best estimate some seconds later.
+
+mod common;
+mod corridor;
+mod frames;
+mod units;
+
+use std::collections::VecDeque;
+
+pub use common::{CommonClock, NotCommon};
+pub use frames::{FrameClock, FrameDoubt, SofMark};
+pub use units::{FrameNs, Ticks, UtcClock, UtcNs};
+
+use corridor::Gate;
+
+/// Round trips that are kept: ten minutes, at one a second.
+const GATES: usize = 600;
+/// Bends that are kept, so that a time can be mapped again: 17 minutes.
+const BENDS: usize = 1024;
+/// How far the rate between ruler and UTC may move in the time that round trips are kept. For a crystal in a box that warms up, a part per
+/// million; the system's clock against the frames is moved by whoever disciplines it, if at all.
+const CRYSTAL_WANDER: f64 = 1e-6;
+const FRAMES_WANDER: f64 = 0.1e-6;
+/// Drift is reported when the round trips leave no more doubt of it, in parts per million.
+const MAX_DOUBT_PPM: f64 = 20.0;
+/// An error of the mapping is worked off over this time.
+const CATCH_UP_NS: f64 = 10e9;
+/// But never so fast that intervals would suffer: what frames are apart matters more than what time it is.
+const MAX_CATCH_UP: f64 = 100e-6;
+
+/// What device time is measured with between two round trips.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum ClockSource {
+    /// USB's start of frame.
+    Frames,
+    /// The device's crystal, since its marks are not to be had or not trusted.
+    RoundTrips(FrameDoubt),
+}
+
+/// What is known about the device's clock.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct ClockReport {
+    /// What times are measured with.
+    pub source: ClockSource,
+    /// How much faster than the computer's the device's clock runs, in parts per million; `None` before
+    /// it could be measured, and for a device that does not run in real time.
+    pub drift_ppm: Option<f64>,
+    /// How much faster than the computer's clock the USB host controller's frames are, likewise.
+    pub frames_ppm: Option<f64>,
+    /// How far off a device time's UTC may be, in nanoseconds. A bound, as far as clocks keep their rates; usually it is much nearer.
+    /// `None` for a device that does not run in real time.
+    pub uncertainty_ns: Option<i64>,
+    /// The quickest round trip, in nanoseconds.
+    pub round_trip_ns: i64,
+}
+
+impl Default for ClockReport {
+    /// Before anything is known.
+    fn default() -> Self {
+        Self {
+            source: ClockSource::RoundTrips(FrameDoubt::NoMarks),
+            drift_ppm: None,
+            frames_ppm: None,
+            uncertainty_ns: None,
+            round_trip_ns: 0,
+        }
+    }
+}
+
+/// A question for the device's time.
+#[derive(Clone, Copy, Debug)]
+struct RoundTrip {
+    at: Ticks,
+    asked: UtcNs,
+    answered: UtcNs,
+}
+
+/// A piece of the line: from here on, this slope.
+#[derive(Clone, Copy, Debug)]
+struct Bend {
+    at: Ticks,
+    utc: UtcNs,
+    ns_per_tick: f64,
+}
+
+impl Bend {
+    fn utc(&self, ticks: Ticks) -> UtcNs {
+        self.utc.plus((ticks.since(self.at) as f64 * self.ns_per_tick) as i64)
+    }
+}
+
+/// Maps device ticks to UTC.
+#[derive(Clone, Debug)]
+pub struct ClockMap {
+    nominal_ns_per_tick: f64,
+    round_trips: VecDeque<RoundTrip>,
+    frames: FrameClock,
+    /// Never empty; the last one counts from now on.
+    bends: VecDeque<Bend>,
+    report: ClockReport,
+}
+
+impl ClockMap {
+    /// A map without any round trip: tick 0 is `utc`.
+    pub fn new(tick_hz: u32, utc: UtcNs) -> Self {
+        let nominal_ns_per_tick = 1e9 / f64::from(tick_hz.max(1));
+        Self {
+            nominal_ns_per_tick,
+            round_trips: VecDeque::new(),
+            frames: FrameClock::new(tick_hz),
+            bends: VecDeque::from([Bend { at: Ticks(0), utc, ns_per_tick: nominal_ns_per_tick }]),
+            report: ClockReport::default(),
+        }
+    }
+
+    /// The UTC time of a device time. For one in the past it is what it was then, for the last 17 minutes.
+    #[inline]
+    pub fn utc(&self, ticks: Ticks) -> UtcNs {
+        let last = &self.bends[self.bends.len() - 1];
+        if ticks.since(last.at) >= 0 {
+            return last.utc(ticks);
+        }
+        self.bends[self.bends.partition_point(|bend| bend.at <= ticks).saturating_sub(1)].utc(ticks)
+    }
+
+    /// The device time of a UTC time: [`Self::utc`] backwards, to the nearest tick.
+    pub fn ticks(&self, utc: UtcNs) -> Ticks {
+        let bend = self.bends[self.bends.partition_point(|bend| bend.utc <= utc).saturating_sub(1)];
+        bend.at.plus((utc.since(bend.utc) as f64 / bend.ns_per_tick).round() as i64)
+    }
+
+    /// The device's time by USB frames.
+    pub const fn frames(&self) -> &FrameClock {
+        &self.frames
+    }
+
+    /// Takes a mark of a frame's start.
+    pub fn mark(&mut self, mark: SofMark) {
+        self.frames.add(mark);
+    }
+
+    /// Takes one round trip: the device's time, and UTC before the question and after the answer.
+    pub fn add(&mut self, at: Ticks, asked: UtcNs, answered: UtcNs) {
+        if self.round_trips.is_empty() {
+            let utc = asked.plus(answered.since(asked) / 2);
+            self.bends = VecDeque::from([Bend { at, utc, ns_per_tick: self.nominal_ns_per_tick }]);
+        }
+        if self.round_trips.len() == GATES {
+            self.round_trips.pop_front();
+        }
+        self.round_trips.push_back(RoundTrip { at, asked, answered });
+        let round_trips = self.round_trips.iter().map(|trip| trip.answered.since(trip.asked));
+        self.report.round_trip_ns = round_trips.min().unwrap_or(0);
+        self.bend(at, CATCH_UP_NS);
+    }
+
+    /// Before anything was mapped: lies exactly on the best estimate.
+    pub fn settle(&mut self) {
+        if let Some(last) = self.round_trips.back() {
+            let at = last.at;
+            self.bends.drain(..self.bends.len() - 1);
+            self.bend(at, 0.0);
+        }
+    }
+
+    /// What is known.
+    pub const fn report(&self) -> ClockReport {
+        self.report
+    }
+
+    /// Continues the line from `now` towards the best estimate, which it meets after `catch_up_ns`; at once if that is 0.
+    fn bend(&mut self, now: Ticks, catch_up_ns: f64) {
+        let trust = self.frames.trust(now);
+        let (wander, rate) = match trust {
+            Ok(()) => (FRAMES_WANDER, self.frames.rate()),
+            Err(_) => (CRYSTAL_WANDER, 1.0),
+        };
+        let at = self.utc(now);
+        let line = loop {
+            let gates = self.gates(now, at, trust.is_ok());
+            match corridor::line(&gates, wander) {
+                Some(line) => break Some(line),
+                // One of the clocks was moved: the newer half knows of it.
+                None if gates.len() > 2 => drop(self.round_trips.drain(..gates.len() / 2)),
+                None => break None,
+            }
+        };
+        let ruler = self.nominal_ns_per_tick * rate;
+        self.report.source = trust.map_or_else(ClockSource::RoundTrips, |()| ClockSource::Frames);
+        let Some(line) = line else {
+            // It does not run in real time. Its frames are as far apart as it says.
+            self.push(Bend { at: now, utc: at, ns_per_tick: self.nominal_ns_per_tick });
+            let ClockReport { source, round_trip_ns, .. } = self.report;
+            self.report = ClockReport { source, round_trip_ns, ..ClockReport::default() };
+            return;
+        };
+        let correction = (line.now_ns / catch_up_ns.max(1.0)).clamp(-MAX_CATCH_UP, MAX_CATCH_UP);
+        let (correction, utc) =
+            if catch_up_ns > 0.0 { (correction, at) } else { (0.0, at.plus(line.now_ns as i64)) };
+        let true_ns_per_tick = ruler * (1.0 + line.rate);
+        self.push(Bend { at: now, utc, ns_per_tick: true_ns_per_tick * (1.0 + correction) });
+        let faster_ppm = |utc_per_nominal: f64| (1.0 / utc_per_nominal - 1.0) * 1e6;
+        let sure = line.rate_doubt * 1e6 <= MAX_DOUBT_PPM;
+        let off_ns = utc.since(at) as f64;
+        self.report.drift_ppm = sure.then(|| faster_ppm(rate * (1.0 + line.rate)));
+        self.report.frames_ppm = (sure && trust.is_ok()).then(|| faster_ppm(1.0 + line.rate));
+        self.report.uncertainty_ns =
+            Some((line.range_ns.1 - off_ns).abs().max((off_ns - line.range_ns.0).abs()).ceil() as i64);
+    }
+
+    fn push(&mut self, bend: Bend) {
+        if self.bends.back().is_some_and(|last| last.at >= bend.at) {
+            // A second one at the same time takes the first one's place.
+            self.bends.pop_back();
+        } else if self.bends.len() == BENDS {
+            self.bends.pop_front();
+        }
+        self.bends.push_back(bend);
+    }
+
+    /// The round trips as gates, seen from `now`, which the present line has at `at`.
+    fn gates(&self, now: Ticks, at: UtcNs, by_frames: bool) -> Vec<Gate> {
+        let frames_now = self.frames.at(now).filter(|_| by_frames);
+        let gate = |trip: &RoundTrip| {
+            let by_frames = frames_now.zip(self.frames.at(trip.at)).map(|(now, then)| then.since(now) as f64);
+            let at_ns = by_frames.unwrap_or_else(|| trip.at.since(now) as f64 * self.nominal_ns_per_tick);
+            Gate {
+                at_ns,
+                asked_ns: trip.asked.since(at) as f64 - at_ns,
+                answered_ns: trip.answered.since(at) as f64 - at_ns,
+            }
+        };
+        self.round_trips.iter().map(gate).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests;

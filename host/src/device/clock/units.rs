@@ -1,0 +1,77 @@
+//! Times by different clocks are different types: a device's, UTC, and that of a USB host controller.
+
+use std::time::{Instant, SystemTime, UNIX_EPOCH};
+
+/// Time by a device's stamp timer: ticks since it started, of which `Hello` tells the rate.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Ticks(pub u64);
+
+impl Ticks {
+    /// Ticks from another time to this one.
+    pub const fn since(self, other: Self) -> i64 {
+        self.0.wrapping_sub(other.0) as i64
+    }
+
+    /// This time, and so many ticks.
+    #[must_use]
+    pub const fn plus(self, ticks: i64) -> Self {
+        Self(self.0.wrapping_add_signed(ticks))
+    }
+}
+
+/// UTC: nanoseconds since the Unix epoch.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct UtcNs(pub i64);
+
+impl UtcNs {
+    /// Nanoseconds from another time to this one.
+    pub const fn since(self, other: Self) -> i64 {
+        self.0 - other.0
+    }
+
+    /// This time, and so many nanoseconds.
+    #[must_use]
+    pub const fn plus(self, ns: i64) -> Self {
+        Self(self.0 + ns)
+    }
+}
+
+/// Time by the frames of a USB host controller: each frame is 10⁶ nanoseconds, whatever it lasts by another clock, and starts at
+/// the multiple of 10⁶ that has its frame number, modulo 2048 of them. From which turn of the frame number it counts is
+/// arbitrary, and different for each device ([`super::CommonClock`] finds the difference).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct FrameNs(pub i64);
+
+impl FrameNs {
+    /// Nanoseconds from another time to this one.
+    pub const fn since(self, other: Self) -> i64 {
+        self.0 - other.0
+    }
+
+    /// This time, and so many nanoseconds.
+    #[must_use]
+    pub const fn plus(self, ns: i64) -> Self {
+        Self(self.0 + ns)
+    }
+}
+
+/// The computer's UTC clock, read once and continued with the monotonic one: a step of the system's
+/// clock in mid-capture moves no frame.
+#[derive(Clone, Copy, Debug)]
+pub struct UtcClock {
+    instant: Instant,
+    utc: UtcNs,
+}
+
+impl UtcClock {
+    /// Reads the system's clock.
+    pub fn start() -> Self {
+        let utc_ns = SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_nanos() as i64);
+        Self { instant: Instant::now(), utc: UtcNs(utc_ns) }
+    }
+
+    /// What it shows at a moment.
+    pub fn at(&self, instant: Instant) -> UtcNs {
+        self.utc.plus(instant.saturating_duration_since(self.instant).as_nanos() as i64)
+    }
+}

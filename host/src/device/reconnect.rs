@@ -1,0 +1,320 @@
+//! A device that may go and come back: unplugged, silent, its session taken or ended by a computer that slept.
+//!
+//! What it captures goes on by itself when it is there again, on channels opened as they were, with the gap in the trace.
+//! What it sent does not: only who asked for that knows whether it is still wanted.
+
+use std::borrow::Borrow;
+use std::time::{Duration, Instant};
+
+use cantap_wire::message::Mode;
+use cantap_wire::{Channel, Hello};
+
+use super::{ClockReport, Counters, Device, DeviceError, Records, Settings};
+use crate::{TraceEvent, TraceRecord};
+
+/// How long after a failure it is tried again.
+const RETRY_AFTER: Duration = Duration::from_millis(500);
+
+/// What came next. `E` is how the caller tells errors.
+#[derive(Debug)]
+pub enum Happening<E> {
+    /// Records, or none within the time.
+    Records(Vec<TraceRecord>),
+    /// The device is gone, or still not there for another reason than before. Where it was lost, the records before this
+    /// end with a loss of an unknown number of frames on each open channel.
+    Gone(E),
+    /// It is there, and its channels are open. The first time, nothing was gone before.
+    Back(Return),
+    /// Everything captured before [`Reconnecting::stop`] has been handed out.
+    Ended,
+}
+
+/// How a device came back.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub struct Return {
+    /// How long it was away; `None` the first time.
+    pub after: Option<Duration>,
+    /// What it is, if it is another board than before.
+    pub other_board: Option<String>,
+    /// Channels that took part in their bus and only listen now: another board's buses may be others.
+    pub only_listening: Vec<Channel>,
+}
+
+/// Opens channels on a device that was not there before.
+type Setup<'a, D, E> = Box<dyn FnMut(&D) -> Result<(), E> + Send + 'a>;
+
+/// Connects to the device: the one with this serial number, if it is known and can be found by it.
+type Connect<'a, D, E> = Box<dyn FnMut(Option<&str>) -> Result<D, E> + Send + 'a>;
+
+/// A device that is opened again whenever it is there. `D` is the handle that connecting makes: a [`Device`], or what a program
+/// wraps around one.
+pub struct Reconnecting<'a, D, E> {
+    /// What messages call it.
+    name: String,
+    connect: Connect<'a, D, E>,
+    setup: Setup<'a, D, E>,
+    session: Option<(D, Records)>,
+    known: Option<Known>,
+    /// Counted in sessions that are over.
+    before: Counters,
+    clock: ClockReport,
+    /// When it was noticed that the device is gone, and how long it had been then.
+    gone: Option<(Instant, Duration)>,
+    /// What was told last, so that nothing is told twice.
+    told: Option<String>,
+    retry_at: Instant,
+    /// Time of the last record handed out.
+    latest_ns: i64,
+    next: Option<Happening<E>>,
+    gaps: Gaps,
+    /// The capture is over: what is gone now is not waited for.
+    stopped: bool,
+    /// Why it did not end well: how much is missing at its end is not known.
+    unaccounted: Option<DeviceError>,
+}
+
+/// Times in which a device was not there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Gaps {
+    /// How many.
+    pub count: u32,
+    /// All together.
+    pub time: Duration,
+}
+
+/// The board of the last session, and what it was to do.
+struct Known {
+    board: String,
+    serial: String,
+    can_clock_hz: u32,
+    settings: Settings,
+}
+
+impl Known {
+    fn name(hello: &Hello) -> String {
+        format!("{} {}", hello.board, hello.serial)
+    }
+
+    fn is(&self, hello: &Hello) -> bool {
+        hello.board == self.board.as_str() && hello.serial == self.serial.as_str()
+    }
+}
+
+impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecting<'a, D, E> {
+    /// A device that need not be there yet; messages call it `name`. `connect` is given the serial number of the board that was
+    /// there, if one was: `port_of` tells where it is now. `setup` opens its channels the first time; later they are opened as
+    /// they were.
+    pub fn new(
+        name: &str,
+        connect: impl FnMut(Option<&str>) -> Result<D, E> + Send + 'a,
+        setup: impl FnMut(&D) -> Result<(), E> + Send + 'a,
+    ) -> Self {
+        Self {
+            name: name.to_owned(),
+            connect: Box::new(connect),
+            setup: Box::new(setup),
+            session: None,
+            known: None,
+            before: Counters::default(),
+            clock: ClockReport::default(),
+            gone: None,
+            told: None,
+            retry_at: Instant::now(),
+            latest_ns: i64::MIN,
+            next: None,
+            gaps: Gaps::default(),
+            stopped: false,
+            unaccounted: None,
+        }
+    }
+
+    /// Connects now, to a device that must be there.
+    pub fn connect(&mut self) -> Result<(), E> {
+        self.reconnect().map(|_| ())
+    }
+
+    /// The device, while it is there.
+    pub fn device(&self) -> Option<&Device> {
+        self.session.as_ref().map(|(handle, _)| handle.borrow())
+    }
+
+    /// What comes next, waited for at most `timeout`; longer while a device that does not answer is tried again.
+    pub fn next(&mut self, timeout: Duration) -> Happening<E> {
+        if let Some(next) = self.next.take() {
+            return next;
+        }
+        let Some((_, records)) = &mut self.session else {
+            return if self.stopped { Happening::Ended } else { self.try_again(timeout) };
+        };
+        match records.next_batch(timeout) {
+            Ok(Some(mut records)) => {
+                self.keep_in_order(&mut records);
+                Happening::Records(records)
+            }
+            Ok(None) => match self.unaccounted.take() {
+                Some(error) => self.lose(error),
+                None => Happening::Ended,
+            },
+            Err(error) => self.lose(error),
+        }
+    }
+
+    /// Takes back the memory of a batch. Not necessary, only quicker.
+    pub fn recycle(&self, batch: Vec<TraceRecord>) {
+        if let Some((_, records)) = &self.session {
+            records.recycle(batch);
+        }
+    }
+
+    /// Ends the capture. What is left comes from [`Self::next`], up to [`Happening::Ended`]. An error if the device is not
+    /// there, or is lost on the way; then what follows ends as well.
+    pub fn stop(&mut self) -> Result<(), E> {
+        self.stopped = true;
+        let Some(device) = self.device() else {
+            let reason = self.told.clone().unwrap_or_default();
+            return Err(DeviceError::StillGone { address: self.name.clone(), reason }.into());
+        };
+        let Err(error) = device.stop() else { return Ok(()) };
+        let said = DeviceError::BadEnd { address: self.name.clone(), reason: error.to_string() };
+        self.unaccounted = Some(error);
+        Err(said.into())
+    }
+
+    /// What was received and lost, in all sessions.
+    pub fn counters(&self) -> Counters {
+        self.device().map_or(self.before, |device| self.before + device.counters())
+    }
+
+    /// What is known of the clock of the device.
+    pub fn clock(&self) -> ClockReport {
+        self.device().map_or(self.clock, Device::clock)
+    }
+
+    /// When it was not there, one that has not ended among them.
+    pub fn gaps(&self) -> Gaps {
+        let open = self.gone.map(|(noticed_at, ago)| ago + noticed_at.elapsed());
+        Gaps {
+            count: self.gaps.count + u32::from(open.is_some()),
+            time: self.gaps.time + open.unwrap_or_default(),
+        }
+    }
+
+    fn keep_in_order(&mut self, records: &mut [TraceRecord]) {
+        // Within a session they are in order; each session has its own idea of what time it is.
+        for record in records.iter_mut().take_while(|record| record.time_ns < self.latest_ns) {
+            record.time_ns = self.latest_ns;
+        }
+        self.latest_ns = records.last().map_or(self.latest_ns, |last| last.time_ns);
+    }
+
+    /// The device has gone: its last word is the gap.
+    fn lose(&mut self, error: DeviceError) -> Happening<E> {
+        let Some((handle, _)) = self.session.take() else { return Happening::Gone(error.into()) };
+        let device: &Device = handle.borrow();
+        self.before = self.before + device.counters();
+        self.clock = device.clock();
+        let (last_known_ns, ago) = device.last_known();
+        let time_ns = self.latest_ns.max(last_known_ns);
+        let channels = device.open_channels().into_iter().map(|(channel, _)| channel.number());
+        let event = TraceEvent::GAP;
+        let mut gap: Vec<_> = channels.map(|channel| TraceRecord { time_ns, channel, event }).collect();
+        self.keep_in_order(&mut gap);
+        self.gone = Some((Instant::now(), ago));
+        self.retry_at = Instant::now() + RETRY_AFTER;
+        self.told = Some(error.to_string());
+        self.next = Some(if self.stopped { Happening::Ended } else { Happening::Gone(error.into()) });
+        Happening::Records(gap)
+    }
+
+    fn try_again(&mut self, timeout: Duration) -> Happening<E> {
+        let wait = self.retry_at.saturating_duration_since(Instant::now());
+        if wait > timeout {
+            std::thread::sleep(timeout);
+            return Happening::Records(Vec::new());
+        }
+        std::thread::sleep(wait);
+        match self.reconnect() {
+            Ok(back) => Happening::Back(back),
+            Err(error) => {
+                self.retry_at = Instant::now() + RETRY_AFTER;
+                let reason = error.to_string();
+                if self.told.as_ref() == Some(&reason) {
+                    return Happening::Records(Vec::new());
+                }
+                self.told = Some(reason);
+                Happening::Gone(error)
+            }
+        }
+    }
+
+    /// Opens the device, wherever it is now, and its channels.
+    fn reconnect(&mut self) -> Result<Return, E> {
+        let handle = (self.connect)(self.known.as_ref().map(|known| known.serial.as_str()))?;
+        let device: &Device = handle.borrow();
+        let hello = device.hello();
+        let mut back = Return::default();
+        let records = device.records();
+        match &self.known {
+            None => (self.setup)(&handle)?,
+            Some(known) if known.is(hello) => device.restore(&known.settings)?,
+            Some(known) => {
+                let name = Known::name(hello);
+                if known.can_clock_hz != hello.can_clock_hz {
+                    return Err(DeviceError::OtherClock { address: self.name.clone(), name }.into());
+                }
+                let mut settings = known.settings.clone();
+                back.only_listening = settings.only_listen();
+                back.other_board = Some(name);
+                device.restore(&settings)?;
+            }
+        }
+        self.known = Some(Known {
+            board: hello.board.as_str().to_owned(),
+            serial: hello.serial.as_str().to_owned(),
+            can_clock_hz: hello.can_clock_hz,
+            settings: device.settings().clone(),
+        });
+        back.after = self.gone.take().map(|(noticed_at, ago)| ago + noticed_at.elapsed());
+        if let Some(after) = back.after {
+            self.gaps.count += 1;
+            self.gaps.time += after;
+        }
+        self.told = None;
+        self.session = Some((handle, records));
+        Ok(back)
+    }
+}
+
+impl Settings {
+    /// Takes every channel that took part in its bus out of it; says which.
+    fn only_listen(&mut self) -> Vec<Channel> {
+        let mut changed = Vec::new();
+        for channel in Channel::ALL {
+            if let Some(config) = &mut self.open[channel.index()]
+                && config.mode != Mode::ListenOnly
+            {
+                config.mode = Mode::ListenOnly;
+                changed.push(channel);
+            }
+        }
+        changed
+    }
+}
+
+impl Device {
+    /// Gives the channels filters and configurations as they were in another session.
+    fn restore(&self, settings: &Settings) -> Result<(), DeviceError> {
+        // Filters of a channel can be changed only while both are closed.
+        for (channel, filters) in Channel::ALL.into_iter().zip(&settings.filters) {
+            if let Some(filters) = filters {
+                self.set_filters(channel, filters)?;
+            }
+        }
+        for (channel, config) in Channel::ALL.into_iter().zip(settings.open) {
+            if config.is_some() {
+                self.open_channel(channel, config)?;
+            }
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,19 @@
+#![doc = include_str!("../README.md")]
+//!
+//! A [`TraceRecord`] is one entry of a trace. [`filter`] chooses among them, [`playback`] gives them out at their own times,
+//! [`diff`] compares two traces, [`bits`] knows how long a frame is on the bus, and [`socketcan`] writes events as Linux does.
+
+#![forbid(unsafe_code)]
+
+pub mod align;
+pub mod diff;
+pub mod filter;
+pub mod playback;
+mod record;
+pub mod socketcan;
+#[cfg(any(test, feature = "proptest"))]
+pub mod testing;
+
+pub use cantap_can::{Frame, FrameBits, Id, bits, bits_on_bus};
+pub use cantap_wire::Channel;
+pub use record::{Direction, TraceEvent, TraceRecord};

@@ -1,0 +1,74 @@
+//! Records for tests: random ones, and one to count.
+
+use cantap_wire::message::DEVICE_TAG;
+use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+use cantap_wire::{Frame, Id};
+use proptest::prelude::*;
+
+use crate::{Direction, TraceEvent, TraceRecord};
+
+/// Any frame that a bus can carry.
+pub fn frame() -> impl Strategy<Value = Frame> {
+    let id = prop_oneof![
+        (0..=Id::MAX_STANDARD).prop_map(|raw| Id::standard(raw).unwrap()),
+        (0..=Id::MAX_EXTENDED).prop_map(|raw| Id::extended(raw).unwrap()),
+    ];
+    (id, any::<bool>(), 0..16_u8, any::<[u8; 8]>())
+        .prop_map(|(id, remote, dlc, data)| Frame::from_bus(id, remote, dlc, data))
+}
+
+/// Any event but a frame.
+pub fn event() -> impl Strategy<Value = TraceEvent> {
+    use BusErrorKind as Kind;
+    let kinds =
+        [Kind::Stuff, Kind::Form, Kind::Acknowledgment, Kind::BitRecessive, Kind::BitDominant, Kind::Crc];
+    let stages = [LossStage::Controller, LossStage::Queue, LossStage::Link, LossStage::Host];
+    let states = [ErrorState::Active, ErrorState::Warning, ErrorState::Passive, ErrorState::BusOff];
+    let reasons = [
+        TransmitFailure::ArbitrationLost,
+        TransmitFailure::BusError,
+        TransmitFailure::Aborted,
+        TransmitFailure::Closed,
+        TransmitFailure::BusOff,
+    ];
+    // Only the device's own frames are overtaken.
+    let overtaken = (DEVICE_TAG..=u32::MAX, any::<u32>()).prop_map(|(tag, periods)| {
+        TraceEvent::TransmitFailed { tag, reason: TransmitFailure::Overtaken { periods } }
+    });
+    let counters = prop::option::of(any::<(u8, u8)>());
+    prop_oneof![
+        (prop::option::of(prop::sample::select(stages.to_vec())), 1..=u32::MAX, any::<bool>())
+            .prop_map(|(stage, count, at_least)| TraceEvent::Lost { stage, count, at_least }),
+        Just(TraceEvent::GAP),
+        (prop::option::of(prop::sample::select(kinds.to_vec())), counters.clone())
+            .prop_map(|(kind, counters)| TraceEvent::BusError { kind, counters }),
+        (1..=u32::MAX).prop_map(|count| TraceEvent::ErrorsSuppressed { count }),
+        (prop::sample::select(states.to_vec()), counters)
+            .prop_map(|(state, counters)| TraceEvent::State { state, counters }),
+        (any::<u32>(), prop::sample::select(reasons.to_vec()))
+            .prop_map(|(tag, reason)| TraceEvent::TransmitFailed { tag, reason }),
+        overtaken,
+    ]
+}
+
+/// A data frame at a time.
+pub fn data_record(time_ns: i64) -> TraceRecord {
+    let frame = "123#DEADBEEF".parse().unwrap();
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+    TraceRecord { time_ns, channel: 1, event }
+}
+
+/// Any record whose time is a multiple of `resolution_ns`, from 1937 to 2096.
+pub fn record(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
+    let frame = (frame(), prop::sample::select(vec![Direction::Rx, Direction::Tx]))
+        .prop_map(|(frame, direction)| TraceEvent::Frame { frame, direction, late: false });
+    let second = 1_000_000_000_i64;
+    let time = -second * second..4 * second * second;
+    (time, 1..=4_u8, prop_oneof![4 => frame, 1 => event()]).prop_map(
+        move |(time_ns, channel, event): (i64, u8, TraceEvent)| TraceRecord {
+            time_ns: time_ns.div_euclid(resolution_ns) * resolution_ns,
+            channel,
+            event,
+        },
+    )
+}

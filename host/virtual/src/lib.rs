@@ -1,0 +1,32 @@
+//! A device without a board: the firmware's own logic, natively, on a simulated bus.
+//!
+//! It proves the logic and the host, in real time or as fast as possible. It does not prove interrupts,
+//! registers or USB: every interrupt is served at once, so stamps are exact and the controllers' FIFOs never
+//! overrun. USB is a pipe that carries no more than the bus would.
+//!
+//! Model time never depends on when the operating system runs the thread: bus, firmware and USB advance
+//! together, in steps that follow the wall clock. A thread that was held up catches up, and gives the host the
+//! time to read that it missed as well.
+
+#![forbid(unsafe_code)]
+
+#[cfg(test)]
+mod any_commands;
+mod board;
+mod check;
+mod controller;
+mod flash;
+mod log;
+mod machine;
+mod options;
+#[cfg(unix)]
+mod pty;
+mod runner;
+pub mod simbus;
+
+pub use check::SequenceCheck;
+pub use machine::{Heard, Witness};
+pub use options::{BadOption, Options, Pace};
+#[cfg(unix)]
+pub use pty::{Terminal, TerminalError, open_terminal};
+pub use runner::{Connection, VirtualDevice, open, start};

@@ -1,0 +1,116 @@
+//! When simulated nodes send.
+
+use std::collections::VecDeque;
+
+use cantap_wire::Frame;
+
+use super::frames::FrameSource;
+use cantap_trace::bits::FrameBits;
+
+/// When the next frame is due.
+#[derive(Clone, Debug)]
+pub enum Schedule {
+    /// Nobody sends.
+    Silent,
+    /// The bus is busy for this share of the time, in per cent; from 100 on frames stand back to back.
+    Load {
+        /// Which frames.
+        source: FrameSource,
+        /// Share of the time.
+        percent: f64,
+    },
+    /// Frames back to back, then a pause.
+    Bursts {
+        /// Which frames.
+        source: FrameSource,
+        /// Frames in a burst.
+        length: u32,
+        /// From the start of a burst to the start of the next, in nanoseconds.
+        period_ns: u64,
+    },
+    /// Frames at their own times.
+    Log {
+        /// Nanoseconds since the log's start, in order, with the frame.
+        entries: std::vec::IntoIter<(u64, Frame)>,
+    },
+}
+
+/// The frames that simulated nodes want to send, one after the other.
+#[derive(Debug)]
+pub struct Traffic {
+    schedule: Schedule,
+    next: Option<(u64, Frame)>,
+    /// Planned, and overtaken by a frame that must be sent again.
+    waiting: VecDeque<(u64, Frame)>,
+    /// Frames given out, for bursts.
+    count: u64,
+    /// Fractions of a nanosecond carried over, so that a load is met exactly.
+    due_ns: f64,
+    started: bool,
+    /// The schedule's time zero.
+    start_ns: u64,
+}
+
+impl Traffic {
+    /// Traffic that begins when it is first asked for.
+    pub const fn new(schedule: Schedule) -> Self {
+        Self {
+            schedule,
+            next: None,
+            waiting: VecDeque::new(),
+            count: 0,
+            due_ns: 0.0,
+            started: false,
+            start_ns: 0,
+        }
+    }
+
+    /// The frame that is next, and when it may start at the earliest. `now_ns` is when the bus became free.
+    pub fn peek(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
+        if !self.started {
+            self.started = true;
+            self.start_ns = now_ns;
+            self.due_ns = now_ns as f64;
+        }
+        if self.next.is_none() {
+            self.next = self.waiting.pop_front().or_else(|| self.plan(now_ns, bitrate_bps));
+        }
+        self.next
+    }
+
+    /// The frame is on the bus.
+    pub fn take(&mut self) {
+        self.next = None;
+    }
+
+    /// The frame was destroyed: it is sent again as soon as the bus is free.
+    pub fn put_back(&mut self, frame: Frame) {
+        if let Some((at_ns, next)) = self.next.replace((0, frame)) {
+            self.waiting.push_front((at_ns, next));
+        }
+    }
+
+    fn plan(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
+        match &mut self.schedule {
+            Schedule::Silent => None,
+            Schedule::Load { source, percent } => {
+                let frame = source.next()?;
+                if *percent >= 100.0 {
+                    return Some((now_ns, frame));
+                }
+                let due_ns = self.due_ns.max(0.0);
+                self.due_ns += FrameBits::of(&frame).duration_ns(bitrate_bps) as f64 * 100.0 / *percent;
+                Some((due_ns as u64, frame))
+            }
+            Schedule::Bursts { source, length, period_ns } => {
+                let burst = self.count / u64::from((*length).max(1));
+                self.count += 1;
+                Some((self.start_ns + burst * *period_ns, source.next()?))
+            }
+            Schedule::Log { entries } => {
+                let (at_ns, frame) = entries.next()?;
+                Some((self.start_ns + at_ns, frame))
+            }
+        }
+    }
+}

@@ -1,0 +1,187 @@
+#!/bin/sh
+# shellcheck shell=dash
+# What the parts share. USBIP and CONTROL, the board's ports on the computer outside, come from /share/ports.
+# shellcheck source=/dev/null
+. /share/ports
+
+OUTSIDE=10.0.2.2
+PORT=/dev/ttyACM0
+CANTAP=/work/cantap
+CHECKS=0
+FAILED=0
+
+mkdir -p /work
+cd /work || exit 1
+# What lies in /share is fetched anew at every use.
+cp /share/cantap .
+dmesg -n 1
+modprobe -a vhci-hcd cdc-acm can-raw slcan
+
+uptime_s() { cut -d' ' -f1 /proc/uptime; }
+
+# Waits up to 10 s until a command succeeds.
+wait_until() {
+  _tries=200
+  until "$@"; do
+    _tries=$((_tries - 1))
+    [ $_tries -gt 0 ] || return 1
+    sleep 0.05
+  done
+}
+
+# random N: a number below N.
+random() { echo $(($(od -An -N4 -tu4 /dev/urandom) % $1)); }
+
+# ---- Checks ----
+
+# verdict STATUS NAME [DETAIL]: counts a check, by its exit status. What NAME says must hold.
+verdict() {
+  CHECKS=$((CHECKS + 1))
+  if [ "$1" = 0 ]; then
+    echo "ok    $2${3:+ ($3)}"
+  else
+    echo "FAIL  $2${3:+ ($3)}"
+    FAILED=$((FAILED + 1))
+  fi
+}
+
+# check NAME COMMAND...: the command's verdict.
+check() {
+  _name=$1
+  shift
+  "$@"
+  verdict $? "$_name"
+}
+
+# ---- The board's script (docs/emulator.md) ----
+
+# board LINE...: says a line to the board and returns its answer.
+board() {
+  _answer=$(echo "$*" | nc -w 30 "$OUTSIDE" "$CONTROL")
+  case $_answer in
+    error:* | '') echo "the board says to \"$*\": $_answer" >&2; return 1 ;;
+  esac
+}
+
+figures() { echo status | nc -w 30 "$OUTSIDE" "$CONTROL"; }
+
+# figure NAME: a number since the mark; of those with one for each channel, the first.
+figure() { figures | sed "s/.*\"$1\":\[*\([0-9.]*\).*/\1/"; }
+
+# both NAME: the two numbers of a figure with one for each channel.
+both() { figures | sed "s/.*\"$1\":\[\([0-9]*\),\([0-9]*\)\].*/\1 \2/"; }
+
+# settled: waits until nothing comes from the device any more.
+settled() {
+  _before=none
+  while _now=$(figure in_bytes) && [ "$_before" != "$_now" ]; do
+    _before=$_now
+    sleep 0.5
+  done
+}
+
+# ---- The device ----
+
+# The port gets another name while a client still holds the one that went away.
+has_port() {
+  for _port in /dev/ttyACM*; do
+    [ -c "$_port" ] && PORT=$_port && return
+  done
+  return 1
+}
+has_no_port() { ! has_port; }
+attach() {
+  usbip --tcp-port "$USBIP" attach -r "$OUTSIDE" -b 1-1 > attach.log 2>&1
+  wait_until has_port
+}
+detach() {
+  usbip detach -p 00 > /dev/null 2>&1
+  wait_until has_no_port
+}
+
+# The device's folder in sysfs, and its two IDs.
+device() { dirname "$(grep -l cantap /sys/bus/usb/devices/*/manufacturer)"; }
+device_id() { echo "$(cat "$(device)/idVendor"):$(cat "$(device)/idProduct")"; }
+
+has_interface() { [ -e "/sys/class/net/$1" ]; }
+
+# ---- The command ----
+
+info() {
+  timeout 60 "$CANTAP" info -d "$PORT" > info.txt 2>&1 && return
+  cat info.txt
+  return 1
+}
+
+# start [OPTION...]: a capture in the background, as $CAPTURE.
+start() {
+  rm -f capture.log capture.json
+  "$CANTAP" capture -d "$PORT" -b 1M -o capture.log --json "$@" > capture.json 2> capture.err &
+  CAPTURE=$!
+}
+
+# stream [OPTION...]: the same, from a mark on, and returns when frames flow.
+is_flowing() { [ "$(figure taken)" -gt 50 ]; }
+stream() {
+  board mark
+  start "$@"
+  wait_until is_flowing || verdict 1 "frames flow when a capture has begun"
+}
+
+# ended CODE: waits for the capture and checks how it ended.
+ended() {
+  wait "$CAPTURE"
+  [ $? = "$1" ]
+}
+
+# A child that has ended is a zombie, or gone.
+is_capturing() { [ -e "/proc/$CAPTURE/status" ] && ! grep -q '^State:.*Z' "/proc/$CAPTURE/status"; }
+has_told() { grep -q "$1" capture.err; }
+
+# survived: the capture has told that the device went away and that it is back, and ends as though nothing had been.
+survived() {
+  wait_until has_told "goes on when the device is back" &&
+    wait_until has_told "the device is back after" &&
+    kill -INT "$CAPTURE" && ended 0 && return
+  kill -9 "$CAPTURE" 2> /dev/null
+  cat capture.err
+  return 1
+}
+
+# exact NAME: the capture is every frame that the controllers took, in order, and many.
+exact() {
+  board dump capture
+  _bad=0
+  for _n in 1 2; do
+    awk -v name=can$((_n - 1)) '$2 == name { print $3 }' capture.log > got$_n
+    cmp -s got$_n /share/capture.taken$_n || _bad=1
+  done
+  [ "$(wc -l < got1)" -gt 50 ] || _bad=1
+  verdict $_bad "$1" "$(wc -l < got1) + $(wc -l < got2) frames"
+  [ $_bad = 0 ] || { wc -l /share/capture.taken?; cat capture.json capture.err; }
+}
+
+# capture_is_exact NAME [SECONDS]: a capture from beginning to end.
+capture_is_exact() {
+  wait_until has_port
+  board mark
+  start -t "${2:-1}"
+  wait "$CAPTURE"
+  exact "$1"
+}
+
+# of_channel N: frames delivered and frames counted lost, as the capture's summary has them.
+of_channel() { sed "s/.*\"channel\":$1,\"frames\":\([0-9]*\),\"lost\":\([0-9]*\).*/\1 \2/" capture.json; }
+
+# counted NAME: delivered and counted lost make what crossed, on both channels.
+counted() {
+  board dump capture
+  for _n in 1 2; do
+    # shellcheck disable=SC2046 # two words
+    set -- "$1" $(of_channel $_n)
+    _crossed=$(wc -l < /share/capture.taken$_n)
+    [ "$_crossed" -gt 50 ] && [ $(($2 + $3)) = "$_crossed" ]
+    verdict $? "$1, channel $_n" "${2:-none} delivered + ${3:-none} lost, $_crossed crossed"
+  done
+  cat capture.err
+}

@@ -1,0 +1,19 @@
+#!/bin/sh
+# shellcheck shell=dash
+# Runs in the guest: the parts, one after the other. Exit code 0 only if nothing failed.
+# shellcheck source=/dev/null
+. /share/guest/lib.sh
+
+# shellcheck source=/dev/null
+. /share/settings
+ALL_PARTS="enumeration captures stalls slcan slcan_reports disturbances chapter9 suspend hub modem_manager xhci"
+for part in ${PARTS:-$ALL_PARTS}; do
+  echo "--- $part, at $(uptime_s) s"
+  # shellcheck source=/dev/null # whichever it is
+  . "/share/guest/parts/$part.sh"
+done
+
+dmesg > /share/dmesg.txt
+figures > /share/figures.json
+echo "--- $CHECKS checks, $FAILED failed, at $(uptime_s) s"
+[ "$FAILED" = 0 ]

@@ -1,0 +1,92 @@
+#!/bin/sh
+# shellcheck shell=dash
+# Whatever may happen to a client, the driver and the cable in mid-stream: the client says so and goes on when the device is back, and the next
+# capture is exact.
+
+has_port || attach
+DEVICE=$(device)
+ID=$(device_id)
+INTERFACE=$(basename "$DEVICE"):1.0
+board traffic 100 mix
+
+# after_a_while TENTHS: sleeps 0.3 s and up to so many tenths more.
+after_a_while() { sleep "$(awk -v n="$(random "$1")" 'BEGIN { print 0.3 + n / 10 }')"; }
+
+_bad=0
+for _ in 1 2 3 4 5 6; do
+  start -t 60
+  after_a_while 15
+  kill -9 "$CAPTURE"
+  wait "$CAPTURE" 2> /dev/null
+  info || _bad=1
+done
+verdict $_bad "the device works after each of 6 clients that were killed in mid-stream"
+capture_is_exact "a capture after killed clients"
+
+stream -t 60
+echo "$INTERFACE" > /sys/bus/usb/drivers/cdc_acm/unbind
+echo "$INTERFACE" > /sys/bus/usb/drivers/cdc_acm/bind
+wait_until has_port
+check "a client whose driver was unbound goes on" survived
+capture_is_exact "a capture after unbind and bind"
+
+stream -t 60
+echo 0 > "$DEVICE/authorized"
+echo 1 > "$DEVICE/authorized"
+wait_until has_port
+check "a client whose device was deauthorized goes on" survived
+capture_is_exact "a capture after the device was deauthorized"
+
+_bad=0
+for _ in 1 2 3 4 5; do usbreset "$ID" > /dev/null || _bad=1; done
+verdict $_bad "5 resets of the port"
+capture_is_exact "a capture after resets"
+stream -t 60
+usbreset "$ID" > /dev/null
+wait_until has_port
+check "a client whose device was reset goes on" survived
+capture_is_exact "a capture after a reset in mid-stream"
+
+stty -F "$PORT" sane
+timeout 1 cat "$PORT" > /dev/null &
+_cat=$!
+printf 'AT\r\nATI\r\n~~~\000\377' > "$PORT"
+wait "$_cat"
+capture_is_exact "a capture after a terminal that echoes, and AT"
+
+stream -t 6
+for _ in 1 2 3 4 5; do
+  sleep 1
+  board halt 82
+done
+wait "$CAPTURE"
+_repeated=$(figure repeated)
+counted "bulk IN is halted 5 times in mid-stream, and every frame is told or its loss"
+[ "$_repeated" = 0 ]
+verdict $? "a halted endpoint begins again with DATA0" "$_repeated packets dropped by their toggle"
+
+"$CANTAP" reset -d "$PORT" > /dev/null
+wait_until has_no_port
+attach
+check "the device works after its own restart" info
+
+# away_and_back COMMAND...: takes the device away at some time of a client's life, and gives it back. One that had not begun yet ends with 1.
+away_and_back() {
+  start -t 60
+  after_a_while 12
+  "$@" || return 1
+  wait_until has_no_port && attach || return 1
+  wait_until has_outcome || return 1
+  if is_capturing; then survived; else ended 1; fi && info
+}
+has_outcome() { ! is_capturing || has_told "the device is back after"; }
+
+_bad=0
+for _ in $(seq 6); do away_and_back detach || _bad=$((_bad + 1)); done
+verdict $_bad "6 detachments at random times: each client goes on when the device is back" "$_bad do not"
+capture_is_exact "a capture after detachments"
+
+_bad=0
+for _ in 1 2 3; do away_and_back board unplug || _bad=$((_bad + 1)); done
+verdict $_bad "the cable is pulled 3 times: each client goes on when the device is back" "$_bad do not"
+capture_is_exact "a capture after pulled cables"

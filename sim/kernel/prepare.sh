@@ -1,0 +1,71 @@
+#!/bin/bash
+# prepare.sh CACHE: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod and xz-utils.
+# The guest's packages are unpacked, never installed here. No version is fixed: it is the stock kernel of this Debian.
+set -euo pipefail
+here=$(cd "$(dirname "$0")" && pwd)
+mkdir -p "$1"
+cd "$1"
+
+# Nothing to do if what is there was made of the same recipe.
+recipe=$(cat "$here/prepare.sh" "$here/init" | sha256sum)
+if [ -f initrd ] && [ "$recipe" = "$(cat recipe 2>/dev/null)" ]; then
+  exit 0
+fi
+
+programs="busybox-static can-utils usbip kmod usbutils iproute2 util-linux perl-base"
+modem_manager="modemmanager udev dbus-daemon dbus-bin"
+modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw slcan cdc-acm vhci-hcd xhci-pci"
+
+# `apt-get` tells where each file comes from, which is of use only if it fails.
+quietly() { "$@" > log 2>&1 || { cat log >&2; return 1; }; }
+
+# Only root may; others take what the last one fetched.
+[ "$(id -u)" != 0 ] || quietly apt-get -q update
+image=$(apt-cache show --no-all-versions linux-image-amd64 | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
+# The libraries that the programs need, and theirs; not those of what they only suggest, in effect, by alternatives.
+# shellcheck disable=SC2086 # lists of words
+libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces --no-enhances \
+  $programs $modem_manager | grep -E '^(lib[a-z0-9+.-]+|zlib1g)$' | grep -vE 'perl|pam|elogind|installer|cryptsetup|systemd-shared' | sort -u)
+rm -rf packages root kernel
+mkdir packages root kernel
+# shellcheck disable=SC2086
+(cd packages && quietly apt-get -q download "$image" $programs $modem_manager $libraries)
+
+for package in packages/*.deb; do
+  case $package in
+    packages/linux-image-*) ;;
+    *) dpkg-deb -x "$package" root ;;
+  esac
+done
+rm -rf root/usr/share/{doc,man,locale,info,lintian,bash-completion,perl,zoneinfo} root/lib/udev/hwdb.d
+rm -rf root/usr/lib/*/{gconv,perl-base/unicore}
+install -m 755 "$here/init" root/init
+# Busybox's shell prefers its own `ip`, which knows nothing of CAN.
+mv "$(find root -path '*bin/ip' -type f)" root/usr/bin/iproute2
+mkdir -p root/{proc,sys,dev,run,share,tmp,root,var/lib}
+ln -sfn ../run root/var/run
+echo 'root:x:0:0:root:/root:/bin/sh' > root/etc/passwd
+echo 'root:x:0:' > root/etc/group
+
+# Modules, with all that they depend on.
+dpkg-deb --fsys-tarfile packages/linux-image-*.deb | tar -x -C kernel --wildcards './boot/vmlinuz*' './lib/modules/*/modules.*' \
+  './lib/modules/*/kernel/net/*' './lib/modules/*/kernel/fs/*' './lib/modules/*/kernel/lib/*' './lib/modules/*/kernel/crypto/*' \
+  './lib/modules/*/kernel/drivers/usb/*' './lib/modules/*/kernel/drivers/net/*' './lib/modules/*/kernel/drivers/virtio/*'
+version=$(basename kernel/lib/modules/*)
+depmod -b kernel "$version"
+for module in $modules; do
+  modprobe -d "$PWD/kernel" -S "$version" --show-depends "$module" | sed -n 's/^insmod \([^ ]*\).*/\1/p'
+done | sort -u | sed "s|^$PWD/kernel/||" > wanted
+(cd kernel && xargs cp --parents -t ../root < ../wanted && cp --parents lib/modules/"$version"/modules.{builtin,builtin.modinfo,order} ../root)
+depmod -b root "$version"
+# Not compressed: unpacking it would be the emulated processor's work.
+(cd root && find . | cpio -o -H newc --quiet) > initrd
+
+# A kernel that need not unpack itself boots in 5 s rather than 20 under emulation. Its payload is one xz stream (found by its magic
+# number) with something behind it, of which xz complains; a payload that is no ELF is a failure.
+offset=$(LC_ALL=C grep -obUaP -m1 '\xfd7zXZ\x00' kernel/boot/vmlinuz-* | head -1 | cut -d: -f1)
+tail -c +$((offset + 1)) kernel/boot/vmlinuz-* | xz -dc --single-stream > vmlinux 2>/dev/null || true
+[ "$(head -c 4 vmlinux | od -An -tx1)" = " 7f 45 4c 46" ] || { echo "the kernel's image holds no ELF" >&2; exit 1; }
+
+rm -rf packages root kernel wanted log
+echo "$recipe" > recipe

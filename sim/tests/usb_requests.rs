@@ -1,0 +1,183 @@
+//! What hosts ask of a device beside data: configured again, interfaces set anew, endpoints halted, requests that are too long or
+//! not offered. The port works afterwards as before, and every frame is delivered or counted.
+
+mod common;
+
+use cantap_sim::machine::Setup;
+use cantap_sim::otg::Misuse;
+use cantap_sim::rig::{MS, Rig};
+use cantap_sim::traffic::{Kind, Traffic};
+use cantap_sim::usb_host::Timing;
+use cantap_sim::usb_host::control::{DEVICE_REMOTE_WAKEUP, Outcome, Request, SET_FEATURE};
+use cantap_wire::{Channel, Command};
+
+const MEGABIT: u32 = 1_000_000;
+const BULK_IN: u8 = 0x82;
+const BULK_OUT: u8 = 0x01;
+const NOTIFY_IN: u8 = 0x81;
+const DATA_INTERFACE: u16 = 1;
+const GET_DESCRIPTOR: u8 = 6;
+
+/// A board that captures both channels.
+fn capturing() -> Option<Rig> {
+    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    rig.connect().unwrap();
+    let from = rig.now();
+    for channel in Channel::ALL {
+        rig.add_traffic(
+            channel,
+            MEGABIT,
+            Traffic::new(Kind::Mix, channel.index() as u64, 30.0, from, u64::MAX),
+        );
+    }
+    listen(&mut rig);
+    Some(rig)
+}
+
+fn listen(rig: &mut Rig) {
+    for channel in Channel::ALL {
+        rig.listen(channel, MEGABIT).unwrap();
+    }
+    rig.run_for(3 * MS).unwrap();
+}
+
+/// How a request on endpoint 0 ends.
+fn ask(rig: &mut Rig, request: Request) -> Outcome {
+    rig.with_host(|host, _| host.control(request));
+    let mut outcome = None;
+    rig.run_while(2000 * MS, |rig| {
+        outcome = rig.with_host(|host, _| host.control_outcome());
+        outcome.is_none()
+    })
+    .unwrap();
+    outcome.expect("a request ends")
+}
+
+/// Nothing was lost on the way, and the controller was driven as it wants to be.
+fn nothing_was_lost(mut rig: Rig) {
+    rig.run_for(3 * MS).unwrap();
+    for channel in Channel::ALL {
+        rig.close(channel).unwrap();
+        assert_eq!(rig.ledger.losses(channel).total(), 0, "{channel:?}");
+        assert!(rig.ledger.delivered_count(channel) > 20, "{channel:?}");
+    }
+    assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+    assert_eq!(rig.with_host(|_, otg| otg.misuse()), Misuse::default());
+    assert_eq!(rig.machine.resets(), 0);
+}
+
+#[test]
+fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
+    let Some(mut rig) = capturing() else { return };
+    for round in 0..6 {
+        // Another number of packets on each pipe every time, so that toggles are odd and even.
+        for _ in 0..round % 3 {
+            rig.ask(Command::Status).unwrap();
+        }
+        rig.run_for(round * MS / 3).unwrap();
+        assert_eq!(ask(&mut rig, Request::set_configuration(0)), Outcome::Done(Vec::new()), "round {round}");
+        rig.run_for(5 * MS).unwrap();
+        for channel in Channel::ALL {
+            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+        }
+        rig.cut();
+        assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()), "round {round}");
+        rig.wait_for_port().unwrap();
+        rig.greet().unwrap_or_else(|error| panic!("round {round}: {error}"));
+        listen(&mut rig);
+    }
+    nothing_was_lost(rig);
+}
+
+#[test]
+fn an_interface_set_anew_under_an_open_port_loses_nothing() {
+    let Some(mut rig) = capturing() else { return };
+    for round in 0..8 {
+        rig.run_for(round * MS / 5).unwrap();
+        assert_eq!(ask(&mut rig, Request::set_interface(DATA_INTERFACE)), Outcome::Done(Vec::new()));
+        rig.ask(Command::Status).unwrap();
+    }
+    nothing_was_lost(rig);
+}
+
+/// The driver comes upon the halt with its next token or packet and ends it, as Linux's does.
+#[test]
+fn a_halt_and_its_end_lose_nothing() {
+    let Some(mut rig) = capturing() else { return };
+    for (round, endpoint) in [BULK_IN, BULK_OUT, BULK_IN, BULK_OUT, BULK_IN].into_iter().enumerate() {
+        rig.run_for(round as u64 * MS / 7).unwrap();
+        let stalls = rig.with_host(|host, _| host.counters().stalls);
+        assert_eq!(ask(&mut rig, Request::halt(endpoint)), Outcome::Done(Vec::new()));
+        rig.ask(Command::Status).unwrap_or_else(|error| panic!("round {round}, {endpoint:#x}: {error}"));
+        assert!(rig.with_host(|host, _| host.counters().stalls) > stalls, "{endpoint:#x} was not halted");
+        assert_eq!(ask(&mut rig, Request::endpoint_status(endpoint)), Outcome::Done(vec![0, 0]));
+    }
+    assert_eq!(ask(&mut rig, Request::halt(NOTIFY_IN)), Outcome::Done(Vec::new()));
+    assert_eq!(ask(&mut rig, Request::endpoint_status(NOTIFY_IN)), Outcome::Done(vec![1, 0]));
+    assert_eq!(ask(&mut rig, Request::clear_halt(NOTIFY_IN)), Outcome::Done(Vec::new()));
+    assert_eq!(ask(&mut rig, Request::endpoint_status(NOTIFY_IN)), Outcome::Done(vec![0, 0]));
+    nothing_was_lost(rig);
+}
+
+#[test]
+fn a_configuration_ends_a_halt() {
+    let Some(mut rig) = capturing() else { return };
+    for endpoint in [BULK_IN, BULK_OUT, NOTIFY_IN] {
+        // With the port closed, no driver comes upon the halt.
+        rig.with_host(|host, _| host.close_port());
+        rig.run_for(5 * MS).unwrap();
+        rig.cut();
+        assert_eq!(ask(&mut rig, Request::halt(endpoint)), Outcome::Done(Vec::new()));
+        assert_eq!(ask(&mut rig, Request::endpoint_status(endpoint)), Outcome::Done(vec![1, 0]));
+        assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()));
+        assert_eq!(
+            ask(&mut rig, Request::endpoint_status(endpoint)),
+            Outcome::Done(vec![0, 0]),
+            "{endpoint:#x}"
+        );
+        rig.wait_for_port().unwrap();
+        rig.greet().unwrap();
+        listen(&mut rig);
+    }
+    nothing_was_lost(rig);
+}
+
+/// usb-device has room for 128 bytes. More is refused, and the next request is answered.
+#[test]
+fn a_request_with_more_data_than_there_is_room_for_is_refused_and_leaves_nothing_behind() {
+    let Some(mut rig) = capturing() else { return };
+    let encapsulated = |len| Request::with_data(0x21, 0, 0, 0, vec![7; len]);
+    for (len, outcome) in [
+        (128, Outcome::Done(Vec::new())),
+        (129, Outcome::Stalled),
+        (64, Outcome::Done(Vec::new())),
+        (500, Outcome::Stalled),
+        (192, Outcome::Stalled),
+    ] {
+        assert_eq!(ask(&mut rig, encapsulated(len)), outcome, "{len} bytes");
+        assert_eq!(
+            ask(&mut rig, Request::endpoint_status(BULK_IN)),
+            Outcome::Done(vec![0, 0]),
+            "after {len}"
+        );
+    }
+    nothing_was_lost(rig);
+}
+
+#[test]
+fn what_the_descriptors_do_not_offer_is_refused() {
+    let Some(mut rig) = capturing() else { return };
+    let wakeup = Request::new(0x00, SET_FEATURE, DEVICE_REMOTE_WAKEUP, 0, 0);
+    assert_eq!(ask(&mut rig, wakeup), Outcome::Stalled);
+    let Outcome::Done(device) = ask(&mut rig, Request::new(0x80, GET_DESCRIPTOR, 1 << 8, 0, 18)) else {
+        panic!()
+    };
+    assert_eq!(device[2..4], [0x00, 0x02], "bcdUSB");
+    let store = Request::new(0x80, GET_DESCRIPTOR, 15 << 8, 0, 5);
+    assert_eq!(ask(&mut rig, store), Outcome::Stalled, "USB 2.0 has no binary object store");
+    let Outcome::Done(head) = ask(&mut rig, Request::new(0x80, GET_DESCRIPTOR, 2 << 8, 0, 9)) else {
+        panic!()
+    };
+    assert_eq!((head[7], head[8]), (0x80, 50), "fed by the bus, without remote wakeup, 100 mA");
+    nothing_was_lost(rig);
+}

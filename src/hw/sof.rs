@@ -1,0 +1,49 @@
+//! The stamp timer's latch of USB's start of frame: channel 4 of TIM2 captures the count when OTG_FS has received a SOF token.
+//!
+//! TIM2's internal trigger 1 is OTG_FS's SOF pulse, in place of TIM8 (RM0090, TIM2_OR, `ITR1_RMP` = 10). The trigger is selected, but
+//! no slave mode, so that it neither starts nor resets the count; the channel's input is the trigger itself (CCMR2, `CC4S` = 11: TRC). No pin and
+//! no interrupt takes part.
+
+use cantap_firmware::ports::Clock;
+use cantap_firmware::sof::SofReading;
+use stm32f4xx_hal::pac::OTG_FS_DEVICE;
+
+use super::stamp::StampTimer;
+
+/// The latch. Priority 2 only, as everything that reads OTG_FS.
+pub struct SofLatch(StampTimer);
+
+impl SofLatch {
+    /// Latches from now on.
+    pub fn start(timer: StampTimer) -> Self {
+        timer.or().write(|w| w.itr1_rmp().otg_fs_sof());
+        timer.smcr().write(|w| w.ts().itr1());
+        // The source can be chosen while the channel is off only.
+        timer.ccmr2_input().write(|w| w.cc4s().trc());
+        timer.ccer().modify(|_, w| w.cc4e().enabled());
+        Self(timer)
+    }
+
+    /// What came since the last call.
+    pub fn take(&mut self) -> Option<SofReading> {
+        let status = self.0.sr().read();
+        if !status.cc4if().bit() {
+            return None;
+        }
+        // The first reading clears the flag.
+        let before = self.0.ccr4().read().bits();
+        let frame = usb().dsts().read().fnsof().bits() & 0x7FF;
+        let after = self.0.ccr4().read().bits();
+        let several = status.cc4of().bit();
+        if several {
+            // Flags are cleared by writing 0; the others, the alarm's with them, are left alone.
+            self.0.sr().write(|w| w.cc4of().clear());
+        }
+        Some(SofReading { latched: [before, after], frame, now: self.0.now(), several })
+    }
+}
+
+fn usb() -> &'static stm32f4xx_hal::pac::otg_fs_device::RegisterBlock {
+    // SAFETY: DSTS has no side effects, and priority 2, which this runs at, is the USB driver's.
+    unsafe { &*OTG_FS_DEVICE::ptr() }
+}

@@ -1,0 +1,116 @@
+//! The data endpoint towards the host: one transfer of several packets at a time, and one interrupt for all of it.
+
+use cantap_firmware::ports::PACKET;
+
+use super::registers::{Endpoint, Registers, epctl, epint, eptsiz};
+use super::{BULK_IN, fifo};
+
+/// Longest transfer: what the FIFO holds, so that no interrupt has to bring more.
+pub const TRANSFER: usize = fifo::BULK_PACKETS * PACKET;
+
+const ENDPOINT: Endpoint = Endpoint::input(BULK_IN);
+/// Bulk, packets of 64 bytes, the FIFO of the endpoint's number, DATA0.
+const ACTIVE: u32 = epctl::USBAEP
+    | 2 << epctl::EPTYP_SHIFT
+    | (BULK_IN as u32) << epctl::TXFNUM_SHIFT
+    | PACKET as u32
+    | epctl::SD0PID;
+
+/// Bulk IN.
+pub struct BulkIn {
+    /// The transfer under way, to be sent again from where the host has got to if it has to be taken back.
+    bytes: [u8; TRANSFER],
+    start: usize,
+    end: usize,
+    under_way: bool,
+    active: bool,
+    halted: bool,
+}
+
+impl BulkIn {
+    pub const fn new() -> Self {
+        Self { bytes: [0; TRANSFER], start: 0, end: 0, under_way: false, active: false, halted: false }
+    }
+
+    /// Into or out of use, empty, with DATA0 and not halted (USB 2.0, 9.1.1.5).
+    pub fn configure(&mut self, registers: &mut Registers, active: bool) {
+        registers.disable_input(BULK_IN);
+        registers.write(ENDPOINT.int(), epint::XFRC);
+        registers.write(ENDPOINT.ctl(), epctl::SNAK | if active { ACTIVE } else { 0 });
+        self.under_way = false;
+        self.halted = false;
+        self.active = active;
+    }
+
+    /// Begins a transfer with as much as goes into one and returns how much that is; `None` if the last one is still under way.
+    pub fn write(&mut self, registers: &mut Registers, bytes: &[u8]) -> Option<usize> {
+        if !self.active || self.under_way {
+            return None;
+        }
+        let len = bytes.len().min(TRANSFER);
+        self.bytes[..len].copy_from_slice(&bytes[..len]);
+        (self.start, self.end) = (0, len);
+        self.under_way = true;
+        if !self.halted {
+            self.arm(registers);
+        }
+        Some(len)
+    }
+
+    fn packets(&self) -> usize {
+        (self.end - self.start).div_ceil(PACKET).max(1)
+    }
+
+    fn arm(&self, registers: &mut Registers) {
+        let bytes = &self.bytes[self.start..self.end];
+        let size = (self.packets() as u32) << eptsiz::PKTCNT_SHIFT | bytes.len() as u32;
+        registers.write(ENDPOINT.tsiz(), size);
+        registers.control(ENDPOINT, 0, epctl::EPENA | epctl::CNAK);
+        fifo::push(registers, BULK_IN, bytes);
+    }
+
+    /// The transfer is through.
+    pub fn done(&mut self) {
+        self.under_way = false;
+    }
+
+    /// Takes the transfer under way out of the controller and keeps what the host has not got of it.
+    fn take_back(&mut self, registers: &mut Registers) {
+        if !self.under_way || self.halted {
+            return;
+        }
+        registers.disable_input(BULK_IN);
+        let left = (registers.read(ENDPOINT.tsiz()) & eptsiz::PKTCNT) >> eptsiz::PKTCNT_SHIFT;
+        let gone = self.packets().saturating_sub(left as usize);
+        self.start = self.end.min(self.start + gone * PACKET);
+        if left == 0 {
+            self.under_way = false;
+            registers.write(ENDPOINT.int(), epint::XFRC);
+        }
+    }
+
+    /// Answers with STALL from here on.
+    pub fn halt(&mut self, registers: &mut Registers) {
+        self.take_back(registers);
+        self.halted = true;
+        registers.control(ENDPOINT, 0, epctl::STALL);
+    }
+
+    /// Begins with DATA0 again, not halted any more (USB 2.0, 9.4.5), with what the host has not got yet.
+    pub fn restart(&mut self, registers: &mut Registers) {
+        if !self.active {
+            return;
+        }
+        self.take_back(registers);
+        self.halted = false;
+        registers.control(ENDPOINT, epctl::STALL, epctl::SD0PID);
+        if self.under_way {
+            self.arm(registers);
+        }
+    }
+
+    /// Whether it is halted.
+    pub const fn is_halted(&self) -> bool {
+        self.halted
+    }
+}

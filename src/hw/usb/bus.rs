@@ -1,0 +1,367 @@
+//! The controller as usb-device sees it: [`Bus`], and behind it [`Core`], which the port and the observer of requests share.
+
+use core::cell::UnsafeCell;
+
+use cantap_firmware::ports::PACKET;
+use usb_device::bus::PollResult;
+use usb_device::endpoint::{EndpointAddress, EndpointType};
+use usb_device::{Result, UsbDirection, UsbError};
+
+use super::bulk_in::BulkIn;
+use super::bulk_out::BulkOut;
+use super::control::Control;
+use super::registers::{
+    DAINT, DAINTMSK, DCFG, DCTL, DIEPMSK, DOEPMSK, DSTS, Endpoint, GAHBCFG, GCCFG, GINTMSK, GINTSTS, GRSTCTL,
+    GRXSTSP, GUSBCFG, PCGCCTL, Registers, dcfg, dctl, dsts, epctl, epint, gahbcfg, gccfg, gint, grstctl,
+    gusbcfg, pktsts,
+};
+use super::{BULK_IN, BULK_OUT, NOTIFY_IN, fifo};
+
+/// TRDT, the answer time in clocks of PHY and AHB, for AHB clocks from 32 MHz up (RM0090, "TRDT values").
+const TURNAROUND: u32 = 6;
+/// Interrupt IN, packets of 8 bytes, the FIFO of the endpoint's number, DATA0. Nothing is ever sent there.
+const NOTIFY_ACTIVE: u32 = epctl::USBAEP
+    | 3 << epctl::EPTYP_SHIFT
+    | (NOTIFY_IN as u32) << epctl::TXFNUM_SHIFT
+    | NOTIFY_PACKET as u32
+    | epctl::SD0PID;
+/// The notification endpoint's packets, as usbd-serial describes them.
+const NOTIFY_PACKET: u16 = 8;
+
+/// The controller with its endpoints.
+pub struct Core {
+    registers: Registers,
+    control: Control,
+    bulk_in: BulkIn,
+    bulk_out: BulkOut,
+    notify_halted: bool,
+    configured: bool,
+    /// The host has the port open, and has not configured the device anew since.
+    dtr: bool,
+    /// As usb-device has been told.
+    suspended: bool,
+}
+
+impl Core {
+    /// Off.
+    pub const fn new(registers: Registers) -> Self {
+        Self {
+            registers,
+            control: Control::new(),
+            bulk_in: BulkIn::new(),
+            bulk_out: BulkOut::new(),
+            notify_halted: false,
+            configured: false,
+            dtr: false,
+            suspended: false,
+        }
+    }
+
+    /// Connects to the bus (RM0090, "Core initialization" and "Device initialization").
+    fn enable(&mut self) {
+        let registers = &mut self.registers;
+        registers.wait_until(GRSTCTL, |value| value & grstctl::AHBIDL != 0);
+        registers.modify(GUSBCFG, 0, gusbcfg::FDMOD);
+        registers.write(GRSTCTL, grstctl::CSRST);
+        registers.wait_until(GRSTCTL, |value| value & grstctl::CSRST == 0);
+        registers.wait_until(GRSTCTL, |value| value & grstctl::AHBIDL != 0);
+        // Nothing on our boards measures VBUS.
+        registers.write(GCCFG, gccfg::PWRDWN | gccfg::NOVBUSSENS);
+        registers.write(PCGCCTL, 0);
+        registers.modify(DCTL, 0, dctl::SDIS);
+        registers.modify(DCFG, 0, dcfg::DSPD_FULL);
+        registers.write(DIEPMSK, epint::XFRC);
+        // What comes is told by the receive FIFO's status.
+        registers.write(DOEPMSK, 0);
+        registers.write(DAINTMSK, 1 | 1 << BULK_IN);
+        registers.write(GINTSTS, !0);
+        let wanted = [gint::USBRST, gint::ENUMDNE, gint::USBSUSP, gint::WKUPINT, gint::IEPINT, gint::RXFLVL];
+        registers.write(GINTMSK, wanted.iter().fold(0, |mask, flag| mask | flag));
+        registers.modify(GAHBCFG, 0, gahbcfg::GINT);
+        registers.modify(DCTL, dctl::SDIS, 0);
+    }
+
+    /// The host drives a reset: all that was going on is over (RM0090, "Endpoint initialization on USB reset"). Endpoint 0 takes
+    /// OUT packets from the end of the enumeration on.
+    fn reset(&mut self) {
+        let Self { registers, control, bulk_in, bulk_out, .. } = self;
+        bulk_in.configure(registers, false);
+        bulk_out.reset(registers);
+        registers.write(Endpoint::input(NOTIFY_IN).ctl(), epctl::SNAK);
+        control.reset(registers);
+        registers.flush_tx(grstctl::ALL_TX_FIFOS);
+        registers.flush_rx();
+        fifo::divide(registers);
+        registers.modify(DCFG, dcfg::DAD, 0);
+        self.configured = false;
+        self.notify_halted = false;
+        self.dtr = false;
+    }
+
+    /// SET_CONFIGURATION. Whoever had the port open has lost it.
+    pub fn configure(&mut self, configured: bool) {
+        let Self { registers, bulk_in, bulk_out, .. } = self;
+        bulk_in.configure(registers, configured);
+        bulk_out.configure(registers, configured);
+        let notify = if configured { NOTIFY_ACTIVE } else { 0 };
+        registers.write(Endpoint::input(NOTIFY_IN).ctl(), notify | epctl::SNAK);
+        self.notify_halted = false;
+        self.configured = configured;
+        self.dtr = false;
+    }
+
+    /// SET_INTERFACE, or the end of a halt: both sides begin with DATA0 again.
+    pub fn restart(&mut self, address: EndpointAddress) {
+        let Self { registers, bulk_in, bulk_out, .. } = self;
+        match (address.direction(), address.index()) {
+            (UsbDirection::In, BULK_IN) => bulk_in.restart(registers),
+            (UsbDirection::Out, BULK_OUT) => bulk_out.restart(registers),
+            (UsbDirection::In, NOTIFY_IN) if self.configured => {
+                self.notify_halted = false;
+                registers.control(Endpoint::input(NOTIFY_IN), epctl::STALL, epctl::SD0PID);
+            }
+            _ => {}
+        }
+    }
+
+    fn halt(&mut self, address: EndpointAddress) {
+        let Self { registers, bulk_in, bulk_out, .. } = self;
+        match (address.direction(), address.index()) {
+            // The controller clears it at the next SETUP packet.
+            (UsbDirection::In, 0) => registers.control(Endpoint::input(0), 0, epctl::STALL),
+            (UsbDirection::Out, 0) => registers.control(Endpoint::output(0), 0, epctl::STALL),
+            (UsbDirection::In, BULK_IN) if self.configured => bulk_in.halt(registers),
+            (UsbDirection::Out, BULK_OUT) if self.configured => bulk_out.halt(registers),
+            (UsbDirection::In, NOTIFY_IN) if self.configured => {
+                self.notify_halted = true;
+                registers.control(Endpoint::input(NOTIFY_IN), 0, epctl::STALL);
+            }
+            _ => {}
+        }
+    }
+
+    fn is_halted(&self, address: EndpointAddress) -> bool {
+        match (address.direction(), address.index()) {
+            (UsbDirection::In, BULK_IN) => self.bulk_in.is_halted(),
+            (UsbDirection::Out, BULK_OUT) => self.bulk_out.is_halted(),
+            (UsbDirection::In, NOTIFY_IN) => self.notify_halted,
+            _ => false,
+        }
+    }
+
+    fn poll(&mut self) -> PollResult {
+        let flags = self.registers.read(GINTSTS);
+        if flags & gint::USBRST != 0 {
+            // Of the silence before a reset nobody needs to hear any more.
+            self.registers.write(GINTSTS, gint::USBRST | gint::USBSUSP | gint::WKUPINT);
+            return PollResult::Reset;
+        }
+        if flags & gint::ENUMDNE != 0 {
+            self.registers.write(GINTSTS, gint::ENUMDNE);
+            self.registers.modify(GUSBCFG, gusbcfg::TRDT, TURNAROUND << gusbcfg::TRDT_SHIFT);
+            Control::arm(&mut self.registers);
+        }
+        if flags & gint::WKUPINT != 0 {
+            self.registers.write(GINTSTS, gint::WKUPINT);
+            return PollResult::Resume;
+        }
+        if flags & gint::USBSUSP != 0 {
+            self.registers.write(GINTSTS, gint::USBSUSP);
+            // It may have been woken since.
+            if self.registers.read(DSTS) & dsts::SUSPSTS != 0 {
+                return PollResult::Suspend;
+            }
+        }
+        let received = self.receive();
+        let sent = if flags & gint::IEPINT == 0 { 0 } else { self.sent() };
+        let (setup, packet) = self.control.waits();
+        // The data endpoints concern usb-device only where they show that the bus is alive.
+        let data = if self.suspended { received | sent & !1 } else { 0 };
+        if setup || packet || (sent & 1 | data) != 0 {
+            return PollResult::Data {
+                ep_setup: u16::from(setup),
+                ep_out: u16::from(packet) | (data & 1 << BULK_OUT),
+                ep_in_complete: sent & 1 | (data & 1 << BULK_IN),
+            };
+        }
+        PollResult::None
+    }
+
+    /// Empties the receive FIFO. Returns the bulk endpoint's bit if there was something for it.
+    fn receive(&mut self) -> u16 {
+        let Self { registers, control, bulk_out, .. } = self;
+        let mut bulk = 0;
+        while registers.read(GINTSTS) & gint::RXFLVL != 0 {
+            let status = registers.read(GRXSTSP);
+            let number = (status & 0xF) as usize;
+            let len = (status >> 4 & 0x7FF) as usize;
+            match (status >> 17 & 0xF, number) {
+                (pktsts::SETUP_DATA, _) => control.take_setup(registers, len),
+                (pktsts::SETUP_COMPLETE, _) => control.setup_done(registers),
+                (pktsts::OUT_DATA, 0) => control.take_packet(registers, len),
+                (pktsts::OUT_COMPLETE, 0) => control.packet_done(),
+                (pktsts::OUT_DATA, _) => {
+                    bulk_out.take_packet(registers, len);
+                    bulk = 1 << BULK_OUT;
+                }
+                (pktsts::OUT_COMPLETE, _) => bulk_out.transfer_done(),
+                _ => {}
+            }
+        }
+        bulk_out.arm(registers);
+        bulk
+    }
+
+    /// Takes note of the IN endpoints whose transfer is through, a bit for each.
+    fn sent(&mut self) -> u16 {
+        let Self { registers, bulk_in, .. } = self;
+        let ended = registers.read(DAINT) & (1 | 1 << BULK_IN);
+        for number in [0, BULK_IN] {
+            if ended >> number & 1 != 0 {
+                registers.write(Endpoint::input(number).int(), epint::XFRC);
+            }
+        }
+        if ended >> BULK_IN & 1 != 0 {
+            bulk_in.done();
+        }
+        ended as u16
+    }
+
+    /// SET_CONTROL_LINE_STATE.
+    pub fn set_dtr(&mut self, up: bool) {
+        self.dtr = up && self.configured;
+    }
+
+    /// Whether the host has the port open.
+    pub const fn dtr(&self) -> bool {
+        self.dtr
+    }
+
+    /// Begins a transfer to the host: see [`BulkIn::write`].
+    pub fn write_bulk(&mut self, bytes: &[u8]) -> Option<usize> {
+        self.bulk_in.write(&mut self.registers, bytes)
+    }
+
+    /// Takes a packet from the host: see [`BulkOut::read`].
+    pub fn read_bulk(&mut self, out: &mut [u8]) -> Option<usize> {
+        self.bulk_out.read(&mut self.registers, out)
+    }
+
+    /// Makes the host wait, or no longer: see [`BulkOut::hold`].
+    pub fn hold_bulk(&mut self, held: bool) {
+        self.bulk_out.hold(&mut self.registers, held);
+    }
+}
+
+/// The core, for those who share it at one priority.
+pub struct Shared(UnsafeCell<Core>);
+
+// SAFETY: all who have a reference to it live in the one `UsbPort`: its `UsbDevice`, its class, its observer. The port is
+// RTIC's `#[lock_free]` resource of tasks at priority 2, each of which runs to its end before another begins, and every way in is
+// through `&mut UsbPort`. So there is never more than one context, as with a `Cell` in one thread.
+unsafe impl Sync for Shared {}
+
+impl Shared {
+    pub const fn new(core: Core) -> Self {
+        Self(UnsafeCell::new(core))
+    }
+
+    /// Does something with the core, which must not come back here; it cannot, since the core does not know of this.
+    pub fn with<R>(&self, act: impl FnOnce(&mut Core) -> R) -> R {
+        // SAFETY: the only reference: one context (see `Sync` above), and no `act` in this module's files calls `with`.
+        act(unsafe { &mut *self.0.get() })
+    }
+}
+
+/// What usb-device drives.
+pub struct Bus {
+    core: &'static Shared,
+    /// Endpoints that are given away, IN in the upper half.
+    given: u32,
+}
+
+impl Bus {
+    pub const fn new(core: &'static Shared) -> Self {
+        Self { core, given: 0 }
+    }
+}
+
+impl usb_device::bus::UsbBus for Bus {
+    /// The controller is set up for endpoint 0 and a CDC-ACM function, and nothing else.
+    fn alloc_ep(
+        &mut self,
+        direction: UsbDirection,
+        _wanted: Option<EndpointAddress>,
+        kind: EndpointType,
+        packet: u16,
+        _interval: u8,
+    ) -> Result<EndpointAddress> {
+        let (number, most) = match (direction, kind) {
+            (_, EndpointType::Control) => (0, PACKET as u16),
+            (UsbDirection::In, EndpointType::Bulk) => (BULK_IN, PACKET as u16),
+            (UsbDirection::Out, EndpointType::Bulk) => (BULK_OUT, PACKET as u16),
+            (UsbDirection::In, EndpointType::Interrupt) => (NOTIFY_IN, NOTIFY_PACKET),
+            _ => return Err(UsbError::Unsupported),
+        };
+        let bit = 1 << (number + if direction == UsbDirection::In { 16 } else { 0 });
+        if self.given & bit != 0 || packet != most {
+            return Err(UsbError::EndpointOverflow);
+        }
+        self.given |= bit;
+        Ok(EndpointAddress::from_parts(number, direction))
+    }
+
+    fn enable(&mut self) {
+        self.core.with(Core::enable);
+    }
+
+    fn reset(&self) {
+        self.core.with(Core::reset);
+    }
+
+    fn set_device_address(&self, address: u8) {
+        self.core.with(|core| core.registers.modify(DCFG, dcfg::DAD, u32::from(address) << dcfg::DAD_SHIFT));
+    }
+
+    fn write(&self, address: EndpointAddress, bytes: &[u8]) -> Result<usize> {
+        self.core.with(|core| match (address.is_in(), address.index()) {
+            (true, 0) => Control::write(&mut core.registers, bytes),
+            (true, BULK_IN) => core.write_bulk(bytes).ok_or(UsbError::WouldBlock),
+            _ => Err(UsbError::InvalidEndpoint),
+        })
+    }
+
+    fn read(&self, address: EndpointAddress, out: &mut [u8]) -> Result<usize> {
+        self.core.with(|core| match (address.is_out(), address.index()) {
+            (true, 0) => core.control.read(&mut core.registers, out),
+            (true, BULK_OUT) => core.read_bulk(out).ok_or(UsbError::WouldBlock),
+            _ => Err(UsbError::InvalidEndpoint),
+        })
+    }
+
+    fn set_stalled(&self, address: EndpointAddress, stalled: bool) {
+        self.core.with(|core| if stalled { core.halt(address) } else { core.restart(address) });
+    }
+
+    fn is_stalled(&self, address: EndpointAddress) -> bool {
+        self.core.with(|core| core.is_halted(address))
+    }
+
+    /// The transceiver's clock stays on. Stopping it saves little beside a processor at 144 MHz, and whether a reset after
+    /// a replug is then seen, with nothing that measures VBUS, only a board can show.
+    fn suspend(&self) {
+        self.core.with(|core| core.suspended = true);
+    }
+
+    fn resume(&self) {
+        self.core.with(|core| core.suspended = false);
+    }
+
+    fn poll(&self) -> PollResult {
+        self.core.with(Core::poll)
+    }
+
+    /// The controller answers the status stage with the address that it had, and takes the new one behind it (RM0090, "Endpoint
+    /// initialization on SetAddress command").
+    const QUIRK_SET_ADDRESS_BEFORE_STATUS: bool = true;
+}

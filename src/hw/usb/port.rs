@@ -1,0 +1,99 @@
+//! The virtual COM port: usb-device and usbd-serial for what hosts ask, the bus itself for data.
+
+use cantap_firmware::ports::{PACKET, Port};
+use cantap_wire::{USB_PID, USB_VID};
+use heapless::String;
+use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
+use stm32f4xx_hal::rcc::{Enable, Rcc, Reset};
+use usb_device::bus::UsbBusAllocator;
+use usb_device::device::{StringDescriptors, UsbDevice, UsbDeviceBuilder, UsbDeviceState, UsbRev, UsbVidPid};
+use usbd_serial::{CdcAcmClass, USB_CLASS_CDC};
+
+use super::bus::{Bus, Core, Shared};
+use super::registers::Registers;
+use super::requests::Requests;
+
+/// Current that is asked of the bus, in mA: what a hub without a supply of its own has for a device (USB 2.0, 7.2.1: one unit load).
+const MAX_POWER_MA: usize = 100;
+
+/// The peripheral.
+type Peripheral = (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK);
+
+/// The port. [`Self::poll`] is the interrupt's.
+pub struct UsbPort {
+    device: UsbDevice<'static, Bus>,
+    class: CdcAcmClass<'static, Bus>,
+    requests: Requests,
+    core: &'static Shared,
+}
+
+/// What must live as long as the program.
+pub struct Memory {
+    core: Option<Shared>,
+    bus: Option<UsbBusAllocator<Bus>>,
+    serial: String<24>,
+}
+
+impl Memory {
+    /// Nothing yet.
+    pub const fn new() -> Self {
+        Self { core: None, bus: None, serial: String::new() }
+    }
+}
+
+impl UsbPort {
+    /// Connects to the bus; a host enumerates the device from now on.
+    pub fn new(usb: Peripheral, rcc: &mut Rcc, serial: &String<24>, memory: &'static mut Memory) -> Self {
+        OTG_FS_GLOBAL::enable(rcc);
+        OTG_FS_GLOBAL::reset(rcc);
+        memory.serial.clone_from(serial);
+        let core: &'static Shared = memory.core.insert(Shared::new(Core::new(Registers::new(usb))));
+        let bus: &'static _ = memory.bus.insert(UsbBusAllocator::new(Bus::new(core)));
+        let class = CdcAcmClass::new(bus, PACKET as u16);
+        let strings = StringDescriptors::default()
+            .manufacturer("cantap")
+            .product("cantap CAN analyser")
+            .serial_number(&memory.serial);
+        let device = UsbDeviceBuilder::new(bus, UsbVidPid(USB_VID, USB_PID))
+            // 2.1 would promise link power management.
+            .usb_rev(UsbRev::Usb200)
+            .device_class(USB_CLASS_CDC)
+            .composite_with_iads()
+            .strings(&[strings])
+            .and_then(|builder| builder.max_packet_size_0(PACKET as u8))
+            .and_then(|builder| builder.max_power(MAX_POWER_MA))
+            // Cannot fail: one language, packets of 64 bytes, and less than the 500 mA that a device may ask for.
+            .expect("the descriptors are within USB's limits")
+            .build();
+        Self { device, class, requests: Requests::new(core), core }
+    }
+
+    /// Looks after the bus: resets, control requests, packets that have come or gone.
+    pub fn poll(&mut self) {
+        // Each turn takes something that waits.
+        while self.device.poll(&mut [&mut self.requests, &mut self.class]) {}
+    }
+}
+
+impl Port for UsbPort {
+    fn is_open(&self) -> bool {
+        self.device.state() == UsbDeviceState::Configured && self.core.with(|core| core.dtr())
+    }
+
+    fn is_suspended(&self) -> bool {
+        // A pulled cable, too, shows as suspend, because nothing measures VBUS.
+        self.device.state() == UsbDeviceState::Suspend && self.core.with(|core| core.dtr())
+    }
+
+    fn write(&mut self, bytes: &[u8]) -> Option<usize> {
+        self.core.with(|core| core.write_bulk(bytes))
+    }
+
+    fn read(&mut self, packet: &mut [u8; PACKET]) -> Option<usize> {
+        self.core.with(|core| core.read_bulk(packet))
+    }
+
+    fn hold(&mut self, hold: bool) {
+        self.core.with(|core| core.hold_bulk(hold));
+    }
+}

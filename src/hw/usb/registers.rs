@@ -1,0 +1,238 @@
+//! OTG_FS's registers in device mode (RM0090, "OTG_FS control and status registers"): offsets, bits, and the one way to reach
+//! them. Names are the manual's.
+
+use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
+
+pub const GAHBCFG: usize = 0x008;
+pub const GUSBCFG: usize = 0x00C;
+pub const GRSTCTL: usize = 0x010;
+pub const GINTSTS: usize = 0x014;
+pub const GINTMSK: usize = 0x018;
+pub const GRXSTSP: usize = 0x020;
+pub const GRXFSIZ: usize = 0x024;
+pub const DIEPTXF0: usize = 0x028;
+pub const GCCFG: usize = 0x038;
+/// DIEPTXF1, the first of those of the endpoints beside endpoint 0.
+pub const DIEPTXF: usize = 0x104;
+pub const DCFG: usize = 0x800;
+pub const DCTL: usize = 0x804;
+pub const DSTS: usize = 0x808;
+pub const DIEPMSK: usize = 0x810;
+pub const DOEPMSK: usize = 0x814;
+pub const DAINT: usize = 0x818;
+pub const DAINTMSK: usize = 0x81C;
+pub const PCGCCTL: usize = 0xE00;
+/// FIFO n is written through the 4 KiB from `FIFO + n * FIFO_STRIDE`; the receive FIFO is read through any of them.
+pub const FIFO: usize = 0x1000;
+pub const FIFO_STRIDE: usize = 0x1000;
+
+/// Bits of GAHBCFG.
+pub mod gahbcfg {
+    pub const GINT: u32 = 1 << 0;
+}
+
+/// Bits of GUSBCFG.
+pub mod gusbcfg {
+    pub const TRDT_SHIFT: u32 = 10;
+    pub const TRDT: u32 = 0xF << TRDT_SHIFT;
+    pub const FDMOD: u32 = 1 << 30;
+}
+
+/// Bits of GRSTCTL.
+pub mod grstctl {
+    pub const CSRST: u32 = 1 << 0;
+    pub const RXFFLSH: u32 = 1 << 4;
+    pub const TXFFLSH: u32 = 1 << 5;
+    pub const TXFNUM_SHIFT: u32 = 6;
+    /// In place of a FIFO's number.
+    pub const ALL_TX_FIFOS: u32 = 0x10;
+    pub const AHBIDL: u32 = 1 << 31;
+}
+
+/// Bits of GINTSTS and GINTMSK.
+pub mod gint {
+    pub const RXFLVL: u32 = 1 << 4;
+    pub const USBSUSP: u32 = 1 << 11;
+    pub const USBRST: u32 = 1 << 12;
+    pub const ENUMDNE: u32 = 1 << 13;
+    pub const IEPINT: u32 = 1 << 18;
+    pub const WKUPINT: u32 = 1 << 31;
+}
+
+/// PKTSTS in GRXSTSP.
+pub mod pktsts {
+    pub const OUT_DATA: u32 = 2;
+    pub const OUT_COMPLETE: u32 = 3;
+    pub const SETUP_COMPLETE: u32 = 4;
+    pub const SETUP_DATA: u32 = 6;
+}
+
+/// Bits of GCCFG.
+pub mod gccfg {
+    pub const PWRDWN: u32 = 1 << 16;
+    pub const NOVBUSSENS: u32 = 1 << 21;
+}
+
+/// Fields of DCFG.
+pub mod dcfg {
+    /// Full speed by the chip's own transceiver.
+    pub const DSPD_FULL: u32 = 3;
+    pub const DAD_SHIFT: u32 = 4;
+    pub const DAD: u32 = 0x7F << DAD_SHIFT;
+}
+
+/// Bits of DCTL.
+pub mod dctl {
+    pub const SDIS: u32 = 1 << 1;
+}
+
+/// Bits of DSTS.
+pub mod dsts {
+    pub const SUSPSTS: u32 = 1 << 0;
+}
+
+/// Bits of DIEPCTLx and DOEPCTLx.
+pub mod epctl {
+    pub const USBAEP: u32 = 1 << 15;
+    pub const EPTYP_SHIFT: u32 = 18;
+    pub const STALL: u32 = 1 << 21;
+    pub const TXFNUM_SHIFT: u32 = 22;
+    pub const CNAK: u32 = 1 << 26;
+    pub const SNAK: u32 = 1 << 27;
+    pub const SD0PID: u32 = 1 << 28;
+    pub const EPDIS: u32 = 1 << 30;
+    pub const EPENA: u32 = 1 << 31;
+    /// What does something when a 1 is written to it, and must not be written back as it was read: a transfer that ends in
+    /// between would be armed again.
+    pub const ACTIONS: u32 = CNAK | SNAK | SD0PID | 1 << 29 | EPDIS | EPENA;
+}
+
+/// Bits of DIEPINTx.
+pub mod epint {
+    pub const XFRC: u32 = 1 << 0;
+    pub const EPDISD: u32 = 1 << 1;
+    pub const INEPNE: u32 = 1 << 6;
+}
+
+/// Fields of DIEPTSIZx and DOEPTSIZx.
+pub mod eptsiz {
+    pub const PKTCNT_SHIFT: u32 = 19;
+    pub const PKTCNT: u32 = 0x3FF << PKTCNT_SHIFT;
+    /// Three SETUP packets in a row, in DOEPTSIZ0.
+    pub const STUPCNT_3: u32 = 3 << 29;
+}
+
+/// An endpoint's registers.
+#[derive(Clone, Copy)]
+pub struct Endpoint(usize);
+
+impl Endpoint {
+    /// IN endpoint `number`.
+    pub const fn input(number: usize) -> Self {
+        Self(0x900 + 0x20 * number)
+    }
+
+    /// OUT endpoint `number`.
+    pub const fn output(number: usize) -> Self {
+        Self(0xB00 + 0x20 * number)
+    }
+
+    /// DIEPCTLx or DOEPCTLx.
+    pub const fn ctl(self) -> usize {
+        self.0
+    }
+
+    /// DIEPINTx or DOEPINTx.
+    pub const fn int(self) -> usize {
+        self.0 + 0x08
+    }
+
+    /// DIEPTSIZx or DOEPTSIZx.
+    pub const fn tsiz(self) -> usize {
+        self.0 + 0x10
+    }
+}
+
+/// A flag of the controller follows within a few clocks of USB; so many reads are more than that, and the end of waiting for
+/// hardware that does not answer.
+const MOST_READS: u32 = 1_000;
+
+/// The controller. Whoever has it is the only one who touches it.
+pub struct Registers(());
+
+#[expect(clippy::unused_self, reason = "having it is the right to touch the controller")]
+impl Registers {
+    /// From the peripheral itself, which nobody else has then.
+    pub fn new(_peripheral: (OTG_FS_GLOBAL, OTG_FS_DEVICE, OTG_FS_PWRCLK)) -> Self {
+        Self(())
+    }
+
+    fn at(offset: usize) -> *mut u32 {
+        OTG_FS_GLOBAL::ptr().cast_mut().cast::<u32>().wrapping_byte_add(offset)
+    }
+
+    /// Reads a register; of some, the next value differs.
+    #[inline]
+    pub fn read(&self, offset: usize) -> u32 {
+        // SAFETY: an aligned address within OTG_FS's 256 KiB, since all offsets are from this file; whoever has `self` is alone.
+        unsafe { Self::at(offset).read_volatile() }
+    }
+
+    /// Writes a register.
+    #[inline]
+    pub fn write(&mut self, offset: usize, value: u32) {
+        // SAFETY: as in `read`; nothing that is written here touches memory, because DMA is never switched on.
+        unsafe { Self::at(offset).write_volatile(value) }
+    }
+
+    /// Clears and sets bits of a register.
+    pub fn modify(&mut self, offset: usize, clear: u32, set: u32) {
+        self.write(offset, self.read(offset) & !clear | set);
+    }
+
+    /// Clears bits of an endpoint's control register, sets others or does what they stand for.
+    #[inline]
+    pub fn control(&mut self, endpoint: Endpoint, clear: u32, set: u32) {
+        self.modify(endpoint.ctl(), clear | epctl::ACTIONS, set);
+    }
+
+    /// Whether a transfer of the endpoint is armed.
+    pub fn is_armed(&self, endpoint: Endpoint) -> bool {
+        self.read(endpoint.ctl()) & epctl::EPENA != 0
+    }
+
+    /// Waits until the register's value is what is wanted, or for too long.
+    pub fn wait_until(&self, offset: usize, wanted: impl Fn(u32) -> bool) {
+        let mut reads = MOST_READS;
+        while reads > 0 && !wanted(self.read(offset)) {
+            reads -= 1;
+        }
+    }
+
+    /// Ends an IN endpoint's transfer in the manual's order: no more packets, off, and what is left of it out of the FIFO of the
+    /// same number (RM0090, "IN endpoint disable").
+    pub fn disable_input(&mut self, number: usize) {
+        let endpoint = Endpoint::input(number);
+        if self.is_armed(endpoint) {
+            self.write(endpoint.int(), epint::INEPNE | epint::EPDISD);
+            self.control(endpoint, 0, epctl::SNAK);
+            self.wait_until(endpoint.int(), |flags| flags & epint::INEPNE != 0);
+            self.control(endpoint, 0, epctl::EPDIS | epctl::SNAK);
+            self.wait_until(endpoint.int(), |flags| flags & epint::EPDISD != 0);
+            self.write(endpoint.int(), epint::EPDISD);
+        }
+        self.flush_tx(number as u32);
+    }
+
+    /// Empties a transmit FIFO, or all of them.
+    pub fn flush_tx(&mut self, number: u32) {
+        self.write(GRSTCTL, grstctl::TXFFLSH | number << grstctl::TXFNUM_SHIFT);
+        self.wait_until(GRSTCTL, |value| value & grstctl::TXFFLSH == 0);
+    }
+
+    /// Empties the receive FIFO.
+    pub fn flush_rx(&mut self) {
+        self.write(GRSTCTL, grstctl::RXFFLSH);
+        self.wait_until(GRSTCTL, |value| value & grstctl::RXFFLSH == 0);
+    }
+}

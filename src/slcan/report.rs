@@ -1,0 +1,60 @@
+//! Losses, errors and states as lines of their own, where a host asks for them (`K1`): those that Linux' slcan driver
+//! understands from 6.0 on (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details -statistics link`.
+//!
+//! `e`, a digit and so many letters are errors; each line counts once, however often it names one. The driver ignores lines
+//! shorter than five characters, so an error is named three times. `s`, a letter and two counters of three decimal digits, receive
+//! and transmit, are a new state.
+
+use core::fmt::Write;
+
+use cantap_wire::Event;
+use cantap_wire::record::{BusErrorKind, ErrorState};
+use heapless::String;
+
+/// The longest line: `s`, state, two counters, CR.
+const MAX_LINE: usize = 1 + 1 + 3 + 3 + 1;
+
+/// A line.
+pub type Line = String<MAX_LINE>;
+
+/// A frame was refused because the transmit queue was full.
+pub fn transmit_overrun() -> Line {
+    error('O')
+}
+
+/// An event's line, if it has one. Errors beyond the device's limit for one by one have no kind, and no line.
+pub fn line(event: &Event) -> Option<Line> {
+    match event {
+        Event::Lost { .. } => Some(error('o')),
+        Event::BusError { kind, .. } => Some(error(match kind {
+            BusErrorKind::Stuff => 's',
+            BusErrorKind::Form => 'f',
+            BusErrorKind::Acknowledgment => 'a',
+            // The driver names the bit as it was sent: B is a recessive one.
+            BusErrorKind::BitRecessive => 'B',
+            BusErrorKind::BitDominant => 'b',
+            BusErrorKind::Crc => 'c',
+        })),
+        Event::State { state, tec, rec, .. } => {
+            let letter = match state {
+                ErrorState::Active => 'a',
+                ErrorState::Warning => 'w',
+                ErrorState::Passive => 'p',
+                ErrorState::BusOff => 'b',
+            };
+            Some(written(format_args!("s{letter}{rec:03}{tec:03}\r")))
+        }
+        _ => None,
+    }
+}
+
+fn error(letter: char) -> Line {
+    written(format_args!("e3{letter}{letter}{letter}\r"))
+}
+
+fn written(text: core::fmt::Arguments<'_>) -> Line {
+    let mut line = Line::new();
+    // It cannot fail: counters have at most three digits.
+    let _ = line.write_fmt(text);
+    line
+}

@@ -1,0 +1,54 @@
+//! `cargo xtask test --only kernel`: the firmware on the emulated board, driven by a stock Linux kernel under QEMU. The scripts are in
+//! `sim/kernel/`.
+
+use anyhow::{Result, bail, ensure};
+use xshell::{Shell, cmd};
+
+use crate::board::Board;
+use crate::peers::is_installed;
+use crate::{toolchain, workspace};
+
+/// What the scripts need on Debian: a program, and the package that has it.
+const PROGRAMS: [(&str, &str); 5] = [
+    ("qemu-system-x86_64", "qemu-system-x86"),
+    ("apt-get", "apt"),
+    ("cpio", "cpio"),
+    ("depmod", "kmod"),
+    ("xz", "xz-utils"),
+];
+
+/// Boots the guest and runs its checks. Where QEMU cannot be had, says so and does nothing, unless peers are required.
+pub fn run(shell: &Shell) -> Result<()> {
+    let elf = Board::ALL[0].elf();
+    ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
+    if let Err(reason) = install_missing(shell) {
+        if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") {
+            bail!("{reason}");
+        }
+        println!("skipped: {reason}");
+        return Ok(());
+    }
+    cmd!(shell, "cargo build --locked -p cantap-cli -p cantap-sim").run()?;
+    let programs = workspace::target().join("debug");
+    let (cantap, simulator) = (programs.join("cantap"), programs.join("cantap-sim"));
+    let cache = workspace::target().join("kernel");
+    cmd!(shell, "bash sim/kernel/prepare.sh {cache}").run()?;
+    cmd!(shell, "bash sim/kernel/run.sh {cache} {cantap} {simulator} {elf}").run()?;
+    Ok(())
+}
+
+/// Installs what is missing, if that is possible; the reason if it is not.
+fn install_missing(shell: &Shell) -> Result<(), String> {
+    let missing: Vec<&str> =
+        PROGRAMS.iter().filter(|(program, _)| !is_installed(program)).map(|(_, package)| *package).collect();
+    if missing.is_empty() {
+        return Ok(());
+    }
+    let packages = missing.join(" ");
+    if !toolchain::can_install() {
+        return Err(format!(
+            "no stock kernel to attach the board to; on Debian run `apt-get install {packages}`"
+        ));
+    }
+    toolchain::install(shell, &missing).map_err(|error| format!("{packages} cannot be installed: {error}"))
+}

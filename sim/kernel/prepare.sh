@@ -1,5 +1,6 @@
 #!/bin/bash
-# prepare.sh CACHE: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod and xz-utils.
+# prepare.sh CACHE: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod and xz-utils. Ends with 75 if the
+# packages cannot be fetched.
 # The guest's packages are unpacked, never installed here. No version is fixed: it is the stock kernel of this Debian.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
@@ -19,8 +20,18 @@ modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw slcan cdc-acm vhci-hc
 # `apt-get` tells where each file comes from, which is of use only if it fails.
 quietly() { "$@" > log 2>&1 || { cat log >&2; return 1; }; }
 
+# A mirror may fail for a moment: each of these is tried again. What cannot be fetched at all ends with 75, "try again later".
+fetch() {
+  for pause in 5 20 60 0; do
+    quietly apt-get -q -o Acquire::Retries=3 "$@" && return
+    sleep $pause
+  done
+  echo "the guest's packages cannot be fetched" >&2
+  exit 75
+}
+
 # Only root may; others take what the last one fetched.
-[ "$(id -u)" != 0 ] || quietly apt-get -q update
+[ "$(id -u)" != 0 ] || fetch update
 image=$(apt-cache show --no-all-versions linux-image-amd64 | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
 # The libraries that the programs need, and theirs; not those of what they only suggest, in effect, by alternatives.
 # shellcheck disable=SC2086 # lists of words
@@ -29,7 +40,9 @@ libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-confl
 rm -rf packages root kernel
 mkdir packages root kernel
 # shellcheck disable=SC2086
-(cd packages && quietly apt-get -q download "$image" $programs $modem_manager $libraries)
+cd packages
+fetch download "$image" $programs $modem_manager $libraries
+cd ..
 
 for package in packages/*.deb; do
   case $package in

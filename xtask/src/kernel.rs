@@ -6,6 +6,7 @@ use xshell::{Shell, cmd};
 
 use crate::board::Board;
 use crate::peers::is_installed;
+use crate::test::Outcome;
 use crate::{toolchain, workspace};
 
 /// What the scripts need on Debian: a program, and the package that has it.
@@ -17,24 +18,41 @@ const PROGRAMS: [(&str, &str); 5] = [
     ("xz", "xz-utils"),
 ];
 
-/// Boots the guest and runs its checks. Where QEMU cannot be had, says so and does nothing, unless peers are required.
-pub fn run(shell: &Shell) -> Result<()> {
+/// What `prepare.sh` ends with where the guest's packages cannot be fetched: `EX_TEMPFAIL` of sysexits.h.
+const NOT_FETCHED: i32 = 75;
+
+/// Boots the guest and runs its checks. Where QEMU or the guest cannot be had, gives the reason and does nothing, unless peers are
+/// required.
+pub fn run(shell: &Shell) -> Result<Outcome> {
     let elf = Board::ALL[0].elf();
     ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
     if let Err(reason) = install_missing(shell) {
-        if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") {
-            bail!("{reason}");
-        }
-        println!("skipped: {reason}");
-        return Ok(());
+        return skip(reason);
     }
     cmd!(shell, "cargo build --locked -p cantap-cli -p cantap-sim").run()?;
     let programs = workspace::target().join("debug");
     let (cantap, simulator) = (programs.join("cantap"), programs.join("cantap-sim"));
     let cache = workspace::target().join("kernel");
-    cmd!(shell, "bash sim/kernel/prepare.sh {cache}").run()?;
+    // Its own words are on the screen already.
+    let prepared = std::process::Command::new("bash")
+        .arg("sim/kernel/prepare.sh")
+        .arg(&cache)
+        .current_dir(shell.current_dir())
+        .status()?;
+    if prepared.code() == Some(NOT_FETCHED) {
+        return skip("the guest's packages cannot be fetched".to_owned());
+    }
+    ensure!(prepared.success(), "sim/kernel/prepare.sh: {prepared}");
     cmd!(shell, "bash sim/kernel/run.sh {cache} {cantap} {simulator} {elf}").run()?;
-    Ok(())
+    Ok(Outcome::Passed)
+}
+
+/// Not run, for a reason, which is a failure where peers are required.
+fn skip(reason: String) -> Result<Outcome> {
+    if std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1") {
+        bail!("{reason}");
+    }
+    Ok(Outcome::Skipped(reason))
 }
 
 /// Installs what is missing, if that is possible; the reason if it is not.

@@ -51,7 +51,7 @@ impl Peers {
                 toolchain::install(shell, &["python3-venv"])?;
             }
             cmd!(shell, "python3 -m venv --clear {venv}").run()?;
-            cmd!(shell, "{python} -m pip install --quiet {packages...}").run()?;
+            cmd!(shell, "{python} -m pip install --quiet --retries 10 {packages...}").run()?;
         }
         Ok(Some(Peers { python }))
     }

@@ -47,6 +47,14 @@ enum Step {
     Package,
 }
 
+/// How a step ended that did not fail.
+pub enum Outcome {
+    /// All of it ran.
+    Passed,
+    /// It could not run here, for this reason.
+    Skipped(String),
+}
+
 /// What can be published, each behind what it needs.
 const PUBLISHED: [&str; 7] = [
     "cantap-can",
@@ -66,18 +74,19 @@ pub fn run(args: &Args) -> Result<()> {
     let shell = workspace::shell()?;
     let toolchain = Toolchain::find_or_install(&shell)?;
     let peers = Peers::find_or_install(&shell)?;
-    let mut done: Vec<(String, Duration)> = Vec::new();
+    let mut done: Vec<(String, Outcome, Duration)> = Vec::new();
     for step in steps {
         let name = step.to_possible_value().map_or_else(String::new, |value| value.get_name().to_owned());
         println!("\n--- {name}");
         let begin = Instant::now();
-        let result = step.run(&shell, toolchain, peers.as_ref());
-        if let Err(error) = result {
-            report(&done);
-            eprintln!("{name:<16} failed; to repeat it: cargo xtask test --only {name}");
-            return Err(error);
+        match step.run(&shell, toolchain, peers.as_ref()) {
+            Ok(outcome) => done.push((name, outcome, begin.elapsed())),
+            Err(error) => {
+                report(&done);
+                eprintln!("{name:<16} failed; to repeat it: cargo xtask test --only {name}");
+                return Err(error);
+            }
         }
-        done.push((name, begin.elapsed()));
     }
     println!();
     report(&done);
@@ -85,7 +94,7 @@ pub fn run(args: &Args) -> Result<()> {
 }
 
 impl Step {
-    fn run(self, shell: &Shell, toolchain: Toolchain, peers: Option<&Peers>) -> Result<()> {
+    fn run(self, shell: &Shell, toolchain: Toolchain, peers: Option<&Peers>) -> Result<Outcome> {
         match self {
             Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
             Step::Firmware => firmware::build_all(shell, toolchain, &Board::ALL)?,
@@ -106,7 +115,7 @@ impl Step {
                 let test = cmd!(shell, "cargo test --locked -p cantap-sim --all-features");
                 with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
             }
-            Step::Kernel => kernel::run(shell)?,
+            Step::Kernel => return kernel::run(shell),
             Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
             Step::Doc => {
                 cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
@@ -118,7 +127,7 @@ impl Step {
                 cmd!(shell, "cargo package --locked --allow-dirty --no-verify {packages...}").run()?;
             }
         }
-        Ok(())
+        Ok(Outcome::Passed)
     }
 }
 
@@ -130,8 +139,11 @@ fn with_peers<'a>(cmd: Cmd<'a>, peers: Option<&Peers>) -> Cmd<'a> {
     }
 }
 
-fn report(done: &[(String, Duration)]) {
-    for (name, time) in done {
-        println!("{name:<16} ok {:>6.1} s", time.as_secs_f64());
+fn report(done: &[(String, Outcome, Duration)]) {
+    for (name, outcome, time) in done {
+        match outcome {
+            Outcome::Passed => println!("{name:<16} ok {:>6.1} s", time.as_secs_f64()),
+            Outcome::Skipped(reason) => println!("{name:<16} NOT RUN: {reason}"),
+        }
     }
 }

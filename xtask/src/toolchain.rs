@@ -100,8 +100,8 @@ pub fn can_install() -> bool {
 
 /// Installs Debian packages.
 pub fn install(shell: &Shell, packages: &[&str]) -> Result<()> {
-    cmd!(shell, "apt-get -q update").env("DEBIAN_FRONTEND", "noninteractive").run()?;
-    cmd!(shell, "apt-get -q install -y --no-install-recommends {packages...}")
+    cmd!(shell, "apt-get -q -o Acquire::Retries=3 update").env("DEBIAN_FRONTEND", "noninteractive").run()?;
+    cmd!(shell, "apt-get -q -o Acquire::Retries=3 install -y --no-install-recommends {packages...}")
         .env("DEBIAN_FRONTEND", "noninteractive")
         .run()?;
     Ok(())

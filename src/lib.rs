@@ -1,34 +1,19 @@
 //! The analyser's logic, free of hardware: it runs on the board, in tests on the host, and in the
 //! virtual device.
 //!
-//! A received frame's way: [`capture`] takes it in the receive interrupt, [`recorder`] writes it with its
-//! time and what was lost before it, [`queue`] holds it, [`sender`] packs it into batches for USB. [`session`] reads what the host asks,
-//! [`command`] does it, [`transmit`] puts frames on the bus. What the hardware must provide is in
-//! [`ports`].
+//! A received frame's way: an interrupt stamps it, [`bus::capture`] takes it out of the controller's FIFO, [`bus::recorder`] writes it
+//! with its time and what was lost before it, [`bus::queue`] holds it, [`port::sender`] packs it into batches for USB.
+//! A request's way: [`port::inbox`] finds it in what the host sends, [`port::session`] decides whether it may be done,
+//! [`port::command`] does it, [`bus::transmit`] puts frames on the bus. What the hardware must provide is in [`ports`], and all of
+//! it together, as commands see it, in [`port::board`].
 #![cfg_attr(not(test), no_std)]
 
-pub mod answers;
-pub mod capture;
-mod checksum;
-pub mod command;
-pub mod errors;
+pub mod bus;
 pub mod failures;
-pub mod filters;
-pub mod inbox;
 pub mod lights;
-mod mailboxes;
-pub mod outbox;
-pub mod periodic;
+pub mod port;
 pub mod ports;
-pub mod queue;
-pub mod recorder;
 pub mod saved;
-pub mod sender;
-pub mod session;
-pub mod slcan;
-pub mod sof;
-pub mod time;
-pub mod transmit;
 
 /// Rate of the stamp timer and of every time on the wire: 12 ticks per microsecond.
 pub const TICK_HZ: u32 = 12_000_000;

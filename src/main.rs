@@ -29,12 +29,12 @@ fn main() {
 mod app {
     use core::sync::atomic::{AtomicU32, Ordering};
 
-    use cantap_firmware::capture::Capture;
-    use cantap_firmware::filters::Layout;
+    use cantap_firmware::bus::capture::Capture;
+    use cantap_firmware::bus::filters::Layout;
+    use cantap_firmware::bus::queue::RecordQueue;
     use cantap_firmware::lights::Activity;
+    use cantap_firmware::port::session::Session;
     use cantap_firmware::ports::{Clock, FilterBanks};
-    use cantap_firmware::queue::RecordQueue;
-    use cantap_firmware::session::Session;
     use cantap_wire::Channel;
 
     use stm32f4xx_hal::pac::Interrupt;
@@ -49,7 +49,7 @@ mod app {
 
     #[shared]
     struct Shared {
-        /// Ceiling 4: what the capture interrupts own.
+        /// Ceiling 4: what the tasks of priority 4 own.
         tap: Tap,
         /// When the interrupt stamped CAN1's last frame.
         can1_entered: AtomicU32,

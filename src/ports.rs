@@ -4,14 +4,11 @@
 //! A CAN controller has two sides. [`Traffic`] is touched by the tasks of priority 4 only,
 //! [`Control`] by commands only; the registers behind them are disjoint, so neither waits for the other.
 
-use cantap_wire::framing;
+use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Failures, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
-use cantap_wire::{CHANNELS, Channel, Frame};
 
-use crate::capture::Capture;
-use crate::filters::Layout;
-use crate::sof::SofReading;
+use crate::bus::filters::Layout;
 
 /// The free-running stamp timer at [`crate::TICK_HZ`], with one alarm.
 pub trait Clock {
@@ -63,7 +60,7 @@ pub trait Traffic {
     /// oldest and drops the newest.
     fn take_overrun(&mut self) -> bool;
     /// Writes a frame to a free mailbox, where it waits for [`Self::request`] or is overwritten by the next. Returns the
-    /// mailbox, a number below [`crate::transmit::MAILBOXES`], or `None` if all are taken.
+    /// mailbox, a number below [`crate::bus::mailboxes::MAILBOXES`], or `None` if all are taken.
     fn prepare(&mut self, frame: &Frame) -> Option<u8>;
     /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
     /// leave in the order of these calls.
@@ -117,45 +114,10 @@ pub trait Chip {
     fn reset(&mut self);
     /// Enters the ROM bootloader; on the board it does not return. Returns whether there is one.
     fn bootloader(&mut self) -> bool;
-    /// Stores bytes (at most [`crate::command::MAX_SAVED`]) over a power cycle; empty erases. Returns whether it worked.
+    /// Stores bytes (at most [`crate::port::command::MAX_SAVED`]) over a power cycle; empty erases. Returns whether it worked.
     fn save(&mut self, bytes: &[u8]) -> bool;
     /// Reads what was stored into `out` and returns its length.
     fn load(&mut self, out: &mut [u8]) -> usize;
-}
-
-/// All of it together, as commands see it.
-pub trait Board<'q, const N: usize> {
-    /// Controllers' traffic side.
-    type Traffic: Traffic;
-    /// Controllers' control side.
-    type Control: Control;
-    /// Stamp timer.
-    type Clock: Clock;
-    /// Acceptance filters.
-    type Filters: FilterBanks;
-    /// The chip.
-    type Chip: Chip;
-
-    /// Lets `act` touch what the highest-priority interrupts share. It holds them up meanwhile, so `act`
-    /// must be short: it adds to the stamps' latency.
-    fn with_capture<R>(
-        &mut self,
-        act: impl FnOnce(&mut Capture<'q, N>, &mut [Self::Traffic; CHANNELS], &Self::Clock) -> R,
-    ) -> R;
-    /// The stamp timer now.
-    fn now(&self) -> u32;
-    /// What the stamp timer has latched of USB's start of frame since the last call; nothing if none came.
-    fn take_sof(&mut self) -> Option<SofReading>;
-    /// The CRC of a message ([`cantap_wire::framing::crc32`]), by hardware where there is some.
-    fn crc32(&mut self, message: &[u8]) -> u32 {
-        framing::crc32(message)
-    }
-    /// A channel's control side.
-    fn control(&mut self, channel: Channel) -> &mut Self::Control;
-    /// The acceptance filters.
-    fn filters(&mut self) -> &mut Self::Filters;
-    /// The chip.
-    fn chip(&mut self) -> &mut Self::Chip;
 }
 
 /// The USB port's data pipes.

@@ -5,7 +5,7 @@ mod arbitrary;
 mod fakes;
 
 use arbitrary::{channel, command};
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage};
 use cantap_wire::{CHANNELS, Channel, Command, Event, Reply, Request};
 use fakes::{Bench, encode, numbered};

@@ -2,7 +2,7 @@
 
 mod fakes;
 
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_wire::message::{ChannelConfig, Mode};
 use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Command, Event, Received, Record, Reply, Stamp};

@@ -3,7 +3,7 @@
 mod fakes;
 
 use cantap_firmware::TICK_HZ;
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_wire::message::Mode;
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{Channel, Command, Event, Reply};

@@ -1,6 +1,6 @@
 //! Compiled filter banks against a model of the hardware's matching: what must pass passes, everything else does not.
 
-use cantap_firmware::filters::{BANKS, Bank, Layout, Shape};
+use cantap_firmware::bus::filters::{BANKS, Bank, Layout, Shape};
 use cantap_wire::message::{Filter, FrameKind};
 use cantap_wire::{Channel, Frame, Id, Refusal};
 use proptest::prelude::*;

@@ -4,9 +4,9 @@ mod fakes;
 
 use std::ops::Range;
 
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::recorder::Recorder;
-use cantap_firmware::sender::Sender;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::recorder::Recorder;
+use cantap_firmware::port::sender::Sender;
 use cantap_firmware::{TICK_HZ, TICKS_PER_MS};
 use cantap_wire::framing::MAX_ENCODED;
 use cantap_wire::message::Mode;

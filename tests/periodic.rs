@@ -3,9 +3,9 @@
 
 mod fakes;
 
-use cantap_firmware::periodic::{MIN_PERIOD_TICKS, PERIODIC_SLOTS};
+use cantap_firmware::bus::periodic::{MIN_PERIOD_TICKS, PERIODIC_SLOTS};
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::ports::Clock;
-use cantap_firmware::queue::RecordQueue;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Periodic, TxFrame};
 use cantap_wire::record::{ErrorState, TransmitFailure};

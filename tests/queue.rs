@@ -2,8 +2,8 @@
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::recorder::Recorder;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::recorder::Recorder;
 use cantap_wire::record::{self, LossStage};
 use cantap_wire::{Channel, Event, Frame, Id, Received, Record, Stamp};
 

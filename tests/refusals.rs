@@ -3,9 +3,9 @@
 
 mod fakes;
 
-use cantap_firmware::periodic::PERIODIC_SLOTS;
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::transmit::{TRIGGER_SLOTS, TX_QUEUE};
+use cantap_firmware::bus::periodic::PERIODIC_SLOTS;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::transmit::{TRIGGER_SLOTS, TX_QUEUE};
 use cantap_wire::message::{
     ChannelConfig, Defaults, Filter, FrameKind, MAX_FILTERS, Mode, Modifier, Periodic, Trigger, TxFrame,
 };
@@ -276,7 +276,7 @@ fn the_longest_answer_is_readable() {
 /// A frame that comes between bus-off and the end of giving the queue up is given up like the others, not forgotten.
 #[test]
 fn a_frame_that_comes_while_the_queue_is_given_up_is_told_of() {
-    use cantap_firmware::transmit::Transmitter;
+    use cantap_firmware::bus::transmit::Transmitter;
     use cantap_wire::record::TransmitFailure;
     let mut transmitter = Transmitter::new(CAN1);
     let mut traffic = fakes::FakeTraffic::default();

@@ -2,7 +2,7 @@
 
 mod fakes;
 
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
 use cantap_wire::message::{EndReason, Filter, FrameKind, Mode, TxFrame};
 use cantap_wire::{Channel, Command, Event, PROTOCOL_VERSION, Refusal, Reply, Request, Response};

@@ -2,9 +2,10 @@
 
 mod fakes;
 
-use cantap_firmware::filters::Shape;
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::transmit::{MAILBOXES, TX_QUEUE};
+use cantap_firmware::bus::filters::Shape;
+use cantap_firmware::bus::mailboxes::MAILBOXES;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::transmit::TX_QUEUE;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::Mode;
 use cantap_wire::record::{BusErrorKind, ErrorState};
@@ -326,7 +327,7 @@ fn acceptance_code_and_mask_become_filters_of_a_closed_channel() {
     let bank = layout.banks.iter().flatten().find(|bank| bank.shape == Shape::Mask16).unwrap();
     assert_eq!((bank.first & 0xFFFF, bank.first >> 16), (0x123 << 5, 0xFFE8), "{layout:?}");
     converse(&mut bench, &[("M00000000", "\x07"), ("mFFFFFFFF", "\x07"), ("C", "\r"), ("mFFFFFFFF", "\r")]);
-    assert_eq!(*bench.board.filters.written.last().unwrap(), cantap_firmware::filters::Layout::open());
+    assert_eq!(*bench.board.filters.written.last().unwrap(), cantap_firmware::bus::filters::Layout::open());
 }
 
 #[test]

@@ -2,8 +2,8 @@
 
 mod fakes;
 
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::sof::SofReading;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::sof::SofReading;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::Mode;
 use cantap_wire::{Channel, Event, Record};

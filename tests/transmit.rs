@@ -2,9 +2,9 @@
 
 mod fakes;
 
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::transmit::TX_QUEUE;
 use cantap_firmware::ports::Clock;
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::transmit::TX_QUEUE;
 use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
 use cantap_wire::message::{
     ChannelConfig, Checksum, DEVICE_TAG, Filter, FrameKind, Mode, Modifier, Periodic, TRIGGER_TAG, Trigger,

@@ -1,9 +1,10 @@
 //! Joins the session, at priority 2, to what the tasks of priority 4 own: [`Board`] over the board.
 
 use cantap_firmware::QUEUE_BYTES;
-use cantap_firmware::capture::Capture;
-use cantap_firmware::ports::{Board, Clock};
-use cantap_firmware::sof::SofReading;
+use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::sof::SofReading;
+use cantap_firmware::port::board::Board;
+use cantap_firmware::ports::Clock;
 use cantap_wire::{CHANNELS, Channel};
 use rtic::Mutex;
 

@@ -1,5 +1,5 @@
 //! The two bxCAN controllers (RM0090, "Controller area network"), each in two halves that share no register
-//! that both write: [`CanTraffic`] for the highest-priority interrupts, [`CanControl`] for commands.
+//! that both write: [`CanTraffic`] for the tasks of priority 4, [`CanControl`] for commands.
 //! [`CanFilters`] are the banks, which lie in CAN1's registers for both.
 //!
 //! The `bxcan` crate is not used: its `enable` waits for the bus, it cannot lock the receive FIFO (so an
@@ -7,9 +7,9 @@
 
 use core::ops::Deref;
 
-use cantap_firmware::filters::{BANKS, Layout, Shape};
+use cantap_firmware::bus::filters::{BANKS, Layout, Shape};
+use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::ports::{Control, ErrorStatus, FilterBanks, Outcome, Traffic};
-use cantap_firmware::transmit::MAILBOXES;
 use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{CHANNELS, Frame, Id};
@@ -26,7 +26,7 @@ const LEC_SEEN: u8 = 7;
 
 /// Both controllers' halves, and the filters.
 pub struct Controllers {
-    /// For the highest-priority interrupts.
+    /// For the tasks of priority 4.
     pub traffic: [CanTraffic; CHANNELS],
     /// For commands.
     pub control: [CanControl; CHANNELS],
@@ -446,7 +446,8 @@ impl FilterBanks for CanFilters {
         let can = &self.can1;
         let bits = |is: fn(Shape) -> bool| {
             let bit = |(number, bank): (usize, &Option<_>)| {
-                u32::from(bank.is_some_and(|bank: cantap_firmware::filters::Bank| is(bank.shape))) << number
+                u32::from(bank.is_some_and(|bank: cantap_firmware::bus::filters::Bank| is(bank.shape)))
+                    << number
             };
             layout.banks.iter().enumerate().map(bit).sum::<u32>()
         };

@@ -18,8 +18,8 @@ pub mod tick;
 pub mod usb;
 pub mod watchdog;
 
-use cantap_firmware::command::Identity;
 use cantap_firmware::lights;
+use cantap_firmware::port::command::Identity;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 

@@ -4,8 +4,8 @@
 //! no slave mode, so that it neither starts nor resets the count; the channel's input is the trigger itself (CCMR2, `CC4S` = 11: TRC). No pin and
 //! no interrupt takes part.
 
+use cantap_firmware::bus::sof::SofReading;
 use cantap_firmware::ports::Clock;
-use cantap_firmware::sof::SofReading;
 use stm32f4xx_hal::pac::OTG_FS_DEVICE;
 
 use super::stamp::StampTimer;

@@ -5,15 +5,16 @@ use std::cell::Cell;
 use std::collections::VecDeque;
 
 use cantap_firmware::TICKS_PER_US;
-use cantap_firmware::capture::Capture;
-use cantap_firmware::command::Identity;
-use cantap_firmware::filters::Layout;
+use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::filters::Layout;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::sof::SofReading;
+use cantap_firmware::port::board::Board;
+use cantap_firmware::port::command::Identity;
+use cantap_firmware::port::session::Session;
 use cantap_firmware::ports::{
-    Board, Chip, Clock, Control, ErrorStatus, FilterBanks, Outcome, PACKET, Port, Traffic,
+    Chip, Clock, Control, ErrorStatus, FilterBanks, Outcome, PACKET, Port, Traffic,
 };
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::session::Session;
-use cantap_firmware::sof::SofReading;
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{ChannelConfig, EndReason, Failures, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};

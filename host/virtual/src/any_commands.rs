@@ -12,7 +12,7 @@ use std::cell::OnceCell;
 use std::io::Write;
 use std::sync::Arc;
 
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len};
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Status};
 use cantap_wire::record::LossStage;

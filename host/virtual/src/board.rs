@@ -6,10 +6,11 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use cantap_firmware::capture::Capture;
-use cantap_firmware::filters::Layout;
-use cantap_firmware::ports::{Board, Chip, Clock, FilterBanks, PACKET, Port};
-use cantap_firmware::sof::SofReading;
+use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::filters::Layout;
+use cantap_firmware::bus::sof::SofReading;
+use cantap_firmware::port::board::Board;
+use cantap_firmware::ports::{Chip, Clock, FilterBanks, PACKET, Port};
 use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
 use cantap_wire::message::Failures;
 use cantap_wire::{CHANNELS, Channel};

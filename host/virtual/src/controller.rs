@@ -7,9 +7,9 @@ use std::collections::VecDeque;
 use std::rc::Rc;
 
 use cantap_firmware::CAN_CLOCK_HZ;
-use cantap_firmware::filters::{Bank, Shape};
+use cantap_firmware::bus::filters::{Bank, Shape};
+use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::ports::{Control, ErrorStatus, Outcome, Traffic};
-use cantap_firmware::transmit::MAILBOXES;
 use cantap_wire::Frame;
 use cantap_wire::message::{ChannelConfig, Mode, RegisterSet};
 use cantap_wire::record::{BusErrorKind, ErrorState};

@@ -5,11 +5,11 @@ use std::rc::Rc;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, Ordering};
 
-use cantap_firmware::capture::Capture;
-use cantap_firmware::command::Identity;
+use cantap_firmware::bus::capture::Capture;
+use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::port::command::Identity;
+use cantap_firmware::port::session::Session;
 use cantap_firmware::ports::Clock;
-use cantap_firmware::queue::RecordQueue;
-use cantap_firmware::session::Session;
 use cantap_wire::{CHANNELS, Channel};
 use heapless::String;
 

@@ -5,7 +5,7 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap_firmware::queue::RecordQueue;
+use cantap_firmware::bus::queue::RecordQueue;
 
 use super::board::{Dtr, Ending, VirtualPort};
 use super::machine::{Machine, Witness, World};

@@ -434,7 +434,7 @@ fn a_channel_with_manual_recovery_stays_off_until_it_is_told_to_come_back() {
 
 #[test]
 fn the_shortest_period_is_the_firmwares() {
-    let firmware_us = cantap_firmware::periodic::MIN_PERIOD_TICKS / cantap_firmware::TICKS_PER_US;
+    let firmware_us = cantap_firmware::bus::periodic::MIN_PERIOD_TICKS / cantap_firmware::TICKS_PER_US;
     assert_eq!(cantap::periodic::SHORTEST_PERIOD_US, u64::from(firmware_us));
 }
 

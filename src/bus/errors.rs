@@ -4,8 +4,8 @@ use cantap_wire::message::RegisterSet;
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{Channel, Event};
 
+use crate::bus::recorder::Recorder;
 use crate::ports::{ErrorStatus, Traffic};
-use crate::recorder::Recorder;
 use crate::{TICK_HZ, TICKS_PER_MS};
 
 /// Errors that are reported one by one in each [`WINDOW_TICKS`]; a broken bus makes up to 50 000 a second.

@@ -5,9 +5,9 @@ use cantap_wire::{Channel, Refusal, Reply};
 use heapless::Vec;
 
 use crate::TICK_HZ;
-use crate::periodic::{self, PERIODIC_SLOTS};
-use crate::ports::Board;
-use crate::transmit::TRIGGER_SLOTS;
+use crate::bus::periodic::{self, PERIODIC_SLOTS};
+use crate::bus::transmit::TRIGGER_SLOTS;
+use crate::port::board::Board;
 
 /// Target times may be so far ahead: a day.
 const MAX_AHEAD_TICKS: u64 = 24 * 3600 * TICK_HZ as u64;

@@ -2,7 +2,7 @@
 
 use cantap_wire::framing::MAX_ENCODED;
 
-use crate::answers;
+use crate::port::answers;
 use crate::ports::{PACKET, Port};
 
 /// Room for all answers and a batch behind them.

@@ -5,10 +5,10 @@ use cantap_wire::record::{LossStage, encode_event, encode_received};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
 
 use crate::QUEUE_BYTES;
-use crate::queue::{Kind, Producer};
-use crate::time::Timebase;
+use crate::bus::queue::{Kind, Producer};
+use crate::bus::time::Timebase;
 
-/// The only writer of the queue. Lives in the highest-priority interrupts.
+/// The only writer of the queue. Belongs to the tasks of priority 4.
 pub struct Recorder<'q, const N: usize = QUEUE_BYTES> {
     producer: Producer<'q, N>,
     time: Timebase,

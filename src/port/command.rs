@@ -6,10 +6,11 @@ use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 use heapless::{String, Vec};
 
-use crate::filters::{BANKS, Layout};
-use crate::periodic::PERIODIC_SLOTS;
-use crate::ports::{Board, Chip, Control, FilterBanks};
-use crate::transmit::{TRIGGER_SLOTS, TX_QUEUE};
+use crate::bus::filters::{BANKS, Layout};
+use crate::bus::periodic::PERIODIC_SLOTS;
+use crate::bus::transmit::{TRIGGER_SLOTS, TX_QUEUE};
+use crate::port::board::Board;
+use crate::ports::{Chip, Control, FilterBanks};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
 mod sending;
@@ -179,7 +180,7 @@ impl Commands {
             }
             Work::Retreat => {
                 for channel in Channel::ALL {
-                    if is_open(channel, board) {
+                    if board.is_open(channel) {
                         begin_close(channel, board);
                     }
                     board.control(channel).stop();
@@ -292,7 +293,7 @@ impl Commands {
         if let Err(refusal) = self.leave(channel, waited, board)? {
             return Some(Err(refusal));
         }
-        let closed = !is_open(channel, board)
+        let closed = !board.is_open(channel)
             || board.with_capture(|capture, traffic, clock| {
                 let overdue = waited > STOP_WITHIN_TICKS;
                 capture.finish_close(channel, &mut traffic[channel.index()], clock, overdue)
@@ -335,7 +336,7 @@ impl Commands {
         config: Option<ChannelConfig>,
         board: &mut impl Board<'q, N>,
     ) -> Result<Step, Refusal> {
-        if is_open(channel, board) {
+        if board.is_open(channel) {
             return Err(Refusal::ChannelOpen);
         }
         let config = if let Some(config) = config {
@@ -357,7 +358,7 @@ impl Commands {
         config: ChannelConfig,
         board: &mut impl Board<'q, N>,
     ) -> Result<Reply, Refusal> {
-        if is_open(channel, board) {
+        if board.is_open(channel) {
             return Err(Refusal::ChannelOpen);
         }
         check(&config)?;
@@ -366,7 +367,7 @@ impl Commands {
     }
 
     fn close<'q, const N: usize>(&mut self, channel: Channel, board: &mut impl Board<'q, N>) -> Step {
-        if !is_open(channel, board) {
+        if !board.is_open(channel) {
             return Step::Done(Reply::Done);
         }
         begin_close(channel, board);
@@ -396,11 +397,11 @@ impl Commands {
         filters: &Vec<Filter, MAX_FILTERS>,
         board: &mut impl Board<'q, N>,
     ) -> Result<Reply, Refusal> {
-        if is_open(channel, board) {
+        if board.is_open(channel) {
             return Err(Refusal::ChannelOpen);
         }
         let layout = self.layout.with(channel, filters)?;
-        let other_open = Channel::ALL.iter().any(|&other| other != channel && is_open(other, board));
+        let other_open = Channel::ALL.iter().any(|&other| other != channel && board.is_open(other));
         if other_open && self.layout.disturbs(&layout) {
             return Err(Refusal::WouldDisturb);
         }
@@ -477,10 +478,6 @@ const fn parse(text: &str) -> u16 {
         index += 1;
     }
     value
-}
-
-fn is_open<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) -> bool {
-    board.with_capture(|capture, _, _| capture.config(channel).is_some())
 }
 
 fn begin_close<'q, const N: usize>(channel: Channel, board: &mut impl Board<'q, N>) {

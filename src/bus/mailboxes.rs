@@ -2,10 +2,11 @@
 
 use cantap_wire::Frame;
 
-use crate::transmit::MAILBOXES;
+/// Transmit mailboxes of a controller.
+pub const MAILBOXES: usize = 3;
 
 /// Frames by mailbox, with their tags. How many there are is asked far more often than it changes.
-pub struct Mailboxes {
+pub(crate) struct Mailboxes {
     places: [Option<(u32, Frame)>; MAILBOXES],
     taken: usize,
 }

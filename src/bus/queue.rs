@@ -1,4 +1,4 @@
-//! The record queue between the capture interrupts and USB: a lock-free byte ring that knows how
+//! The record queue between the tasks of priority 4 and USB: a lock-free byte ring that knows how
 //! full it is. Records are whole and contiguous in it.
 
 use core::sync::atomic::{AtomicU32, Ordering};

@@ -1,22 +1,23 @@
 //! One host at a time: what it sends is read here, and everything that it gets leaves here.
 //!
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
-//! Runs below the capture interrupts, in the USB interrupt and the millisecond tick; nothing waits.
+//! Runs below the tasks of priority 4, in the USB interrupt and the millisecond tick; nothing waits.
 
 use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{EndReason, read_send, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request};
 
 use crate::QUEUE_BYTES;
-use crate::answers::Answers;
-use crate::command::{Commands, Identity, Step, Work, send};
-use crate::inbox::Inbox;
-use crate::outbox::Outbox;
-use crate::ports::{Board, ON_ITS_WAY, PACKET, Port};
-use crate::queue::Consumer;
-use crate::sender::Sender;
-use crate::slcan::{Answer, Slcan};
-use crate::sof::SofMarks;
+use crate::bus::queue::Consumer;
+use crate::bus::sof::SofMarks;
+use crate::port::answers::Answers;
+use crate::port::board::Board;
+use crate::port::command::{Commands, Identity, Step, Work, send};
+use crate::port::inbox::Inbox;
+use crate::port::outbox::Outbox;
+use crate::port::sender::Sender;
+use crate::port::slcan::{Answer, Slcan};
+use crate::ports::{ON_ITS_WAY, PACKET, Port};
 
 /// Longest request on the wire, zero byte included.
 const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);

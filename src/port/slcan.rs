@@ -13,9 +13,9 @@ use cantap_wire::record::{self, ErrorState, LossStage, Record, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Id, Refusal};
 use heapless::{String, Vec};
 
-use crate::command::{Commands, Step, Work, send};
-use crate::ports::Board;
-use crate::queue::Consumer;
+use crate::bus::queue::Consumer;
+use crate::port::board::Board;
+use crate::port::command::{Commands, Step, Work, send};
 use crate::{CAN_CLOCK_HZ, TICKS_PER_MS, TICKS_PER_US};
 
 /// The channel that slcan works on.

@@ -10,13 +10,14 @@ use cantap_wire::record::{ErrorState, LossStage, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Event, Received};
 
 use crate::QUEUE_BYTES;
-use crate::errors::ErrorMonitor;
+use crate::bus::errors::ErrorMonitor;
+use crate::bus::queue::Producer;
+use crate::bus::recorder::Recorder;
+use crate::bus::sof::SofMark;
+use crate::bus::time::NEVER;
+use crate::bus::transmit::Transmitter;
 use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
-use crate::queue::Producer;
-use crate::recorder::Recorder;
-use crate::sof::SofMark;
-use crate::transmit::{NEVER, Transmitter};
 
 /// An alarm is never set farther ahead than this, a quarter of the timer's range; it is set again then.
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
@@ -32,7 +33,7 @@ struct ChannelState {
     transmitter: Transmitter,
 }
 
-/// Everything the highest-priority interrupts share.
+/// Everything the tasks of priority 4 share.
 pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     recorder: Recorder<'q, N>,
     channels: [ChannelState; CHANNELS],

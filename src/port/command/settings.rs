@@ -5,8 +5,8 @@ use cantap_wire::{CHANNELS, Channel, Refusal, Reply};
 use heapless::Vec;
 use serde::{Deserialize, Serialize};
 
-use super::is_open;
-use crate::ports::{Board, Chip};
+use crate::port::board::Board;
+use crate::ports::Chip;
 
 /// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each.
 pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12);
@@ -41,7 +41,7 @@ pub(super) fn store<'q, const N: usize>(
     bytes: &[u8],
     board: &mut impl Board<'q, N>,
 ) -> Result<Reply, Refusal> {
-    if Channel::ALL.iter().any(|&channel| is_open(channel, board)) {
+    if Channel::ALL.iter().any(|&channel| board.is_open(channel)) {
         return Err(Refusal::ChannelOpen);
     }
     if board.chip().save(bytes) { Ok(Reply::Done) } else { Err(Refusal::Hardware) }

@@ -11,9 +11,9 @@ use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Event, Frame};
 use heapless::Deque;
 
-use crate::checksum::checksum;
-use crate::recorder::Recorder;
-use crate::transmit::NEVER;
+use crate::bus::checksum::checksum;
+use crate::bus::recorder::Recorder;
+use crate::bus::time::NEVER;
 use crate::{TICK_HZ, TICKS_PER_US};
 
 /// Entries of a channel: as many as a word has bits.

@@ -1,7 +1,7 @@
 //! Puts frames on the bus: a queue in order, frames at their time, periodic frames, replies.
 //!
-//! One per channel, in the highest-priority interrupts. Mailboxes leave in the order in which they were requested.
-//! Whenever one is free, a reply goes first, then a periodic frame that is due ([`crate::periodic`]), then the queue's head once
+//! One per channel, in the tasks of priority 4. Mailboxes leave in the order in which they were requested.
+//! Whenever one is free, a reply goes first, then a periodic frame that is due ([`crate::bus::periodic`]), then the queue's head once
 //! its time has come.
 //!
 //! Each call does a bounded piece of work: it fills the free mailboxes, three at most, and writes at most `GIVEN_UP_PER_CALL`
@@ -12,13 +12,12 @@ use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Event, Frame};
 use heapless::Deque;
 
-use crate::mailboxes::Mailboxes;
-use crate::periodic::PeriodicTable;
+use crate::bus::mailboxes::{MAILBOXES, Mailboxes};
+use crate::bus::periodic::PeriodicTable;
+use crate::bus::recorder::Recorder;
+use crate::bus::time::NEVER;
 use crate::ports::{Outcome, Traffic};
-use crate::recorder::Recorder;
 
-/// Transmit mailboxes of a controller.
-pub const MAILBOXES: usize = 3;
 /// Frames that the queue holds: 28 ms of the shortest eight-byte frames at 1 Mbit/s.
 pub const TX_QUEUE: usize = 256;
 /// Replies.
@@ -26,8 +25,6 @@ pub const TRIGGER_SLOTS: usize = 8;
 
 /// Frames of the queue that one call gives up: a whole queue at once would take longer than a receive FIFO can wait.
 const GIVEN_UP_PER_CALL: usize = 16;
-/// "Never", for due times.
-pub const NEVER: u64 = u64::MAX;
 
 #[derive(Clone, Copy)]
 struct Queued {

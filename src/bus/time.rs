@@ -1,5 +1,8 @@
 //! Extends the 32-bit stamp timer to 64 bits without a race.
 
+/// A due time that never comes.
+pub const NEVER: u64 = u64::MAX;
+
 /// The device's time. It must see a stamp at least once in half the timer's range (179 s at 12 MHz);
 /// the millisecond tick takes care of that.
 #[derive(Debug, Default)]

@@ -1,0 +1,48 @@
+//! The whole board, as commands see it: the hardware's traits ([`crate::ports`]) and the capture, which belongs to other tasks.
+
+use cantap_wire::framing;
+use cantap_wire::{CHANNELS, Channel};
+
+use crate::bus::capture::Capture;
+use crate::bus::sof::SofReading;
+use crate::ports::{Chip, Clock, Control, FilterBanks, Traffic};
+
+/// All of the hardware, and the way to the buses' state.
+pub trait Board<'q, const N: usize> {
+    /// Controllers' traffic side.
+    type Traffic: Traffic;
+    /// Controllers' control side.
+    type Control: Control;
+    /// Stamp timer.
+    type Clock: Clock;
+    /// Acceptance filters.
+    type Filters: FilterBanks;
+    /// The chip.
+    type Chip: Chip;
+
+    /// Lets `act` touch what the tasks of priority 4 own. It holds them up meanwhile, so `act` must be short: frames wait in the
+    /// FIFOs, and what is due leaves late. Stamps are taken at a higher priority and do not wait.
+    fn with_capture<R>(
+        &mut self,
+        act: impl FnOnce(&mut Capture<'q, N>, &mut [Self::Traffic; CHANNELS], &Self::Clock) -> R,
+    ) -> R;
+    /// The stamp timer now.
+    fn now(&self) -> u32;
+    /// What the stamp timer has latched of USB's start of frame since the last call; nothing if none came.
+    fn take_sof(&mut self) -> Option<SofReading>;
+    /// The CRC of a message ([`cantap_wire::framing::crc32`]), by hardware where there is some.
+    fn crc32(&mut self, message: &[u8]) -> u32 {
+        framing::crc32(message)
+    }
+    /// A channel's control side.
+    fn control(&mut self, channel: Channel) -> &mut Self::Control;
+    /// The acceptance filters.
+    fn filters(&mut self) -> &mut Self::Filters;
+    /// The chip.
+    fn chip(&mut self) -> &mut Self::Chip;
+
+    /// Whether a channel is open.
+    fn is_open(&mut self, channel: Channel) -> bool {
+        self.with_capture(|capture, _, _| capture.config(channel).is_some())
+    }
+}

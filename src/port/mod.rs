@@ -1,0 +1,13 @@
+//! The side of the host: from the record queue to USB, and from a host's requests to what they ask for.
+//!
+//! Everything here runs at priority 2 on the board. It reaches what belongs to the buses' tasks only through
+//! [`board::Board::with_capture`], which is RTIC's lock there.
+
+pub mod answers;
+pub mod board;
+pub mod command;
+pub mod inbox;
+pub mod outbox;
+pub mod sender;
+pub mod session;
+pub mod slcan;

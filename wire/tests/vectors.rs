@@ -4,6 +4,8 @@
 
 mod samples;
 
+use std::fmt::Write;
+
 use cantap_wire::batch::BatchWriter;
 use cantap_wire::framing::{CRC_LEN, MAX_ENCODED, MAX_MESSAGE, encode, seal};
 use cantap_wire::message::{DeviceMessage, EndReason};
@@ -293,7 +295,7 @@ fn file() -> String {
     let mut text = format!("{{\n\"about\": {},\n\"protocol\": {PROTOCOL_VERSION}", json!(ABOUT));
     for (name, vectors) in parts {
         let lines: Vec<String> = vectors.iter().map(Value::to_string).collect();
-        text += &format!(",\n\"{name}\": [\n{}\n]", lines.join(",\n"));
+        let _ = write!(text, ",\n\"{name}\": [\n{}\n]", lines.join(",\n"));
     }
     text + "\n}\n"
 }
@@ -346,16 +348,13 @@ fn the_document_has_every_variant() {
         });
         assert!(row, "no row for {index} {name}");
     };
-    let mut seen = std::collections::BTreeSet::new();
-    let mut check_new = |table: &str, bytes: &str, name: String| {
-        if seen.insert(format!("{table} {name}")) {
-            check(usize::from_str_radix(&bytes[..2], 16).unwrap(), name);
-        }
-    };
-    commands().iter().for_each(|(command, bytes)| check_new("command", bytes, variant(command)));
-    replies().iter().for_each(|(reply, bytes)| check_new("reply", bytes, variant(reply)));
-    refusals().iter().for_each(|(refusal, bytes)| check_new("refusal", bytes, variant(refusal)));
-    events().iter().for_each(|(event, bytes)| check_new("event", bytes, variant(event)));
+    let commands = commands().into_iter().map(|(command, bytes)| (bytes, variant(&command)));
+    let replies = replies().into_iter().map(|(reply, bytes)| (bytes, variant(&reply)));
+    let refusals = refusals().into_iter().map(|(refusal, bytes)| (bytes, variant(&refusal)));
+    let events = events().into_iter().map(|(event, bytes)| (bytes, variant(&event)));
+    for (bytes, name) in commands.chain(replies).chain(refusals).chain(events) {
+        check(usize::from_str_radix(&bytes[..2], 16).unwrap(), name);
+    }
     assert!(document.contains(&format!("version {PROTOCOL_VERSION}")));
 }
 

@@ -14,8 +14,8 @@ use cantap::replay::{Pace, Replay};
 use cantap::wire::message::{ChannelConfig, Filter, FrameKind, Hello, Mode, TxFrame};
 use cantap::wire::{BitTiming, Command, Frame, Refusal, Reply};
 use cantap::{Channel, Device, DeviceError};
+use cantap_emu::bus::Member;
 use cantap_sim::address::Address;
-use cantap_sim::bus::Member;
 
 const CHANNEL: Channel = Channel::Can1;
 const BITRATE_BPS: u32 = 500_000;

@@ -2,14 +2,15 @@
 
 use std::path::PathBuf;
 
+use crate::board::CLOCK;
+use crate::firmware::{self, FirmwareError};
 use cantap_wire::Channel;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
 use crate::CYCLES_PER_SECOND;
-use crate::elf::{ElfError, Image};
 use crate::link::{EmulatedPort, Manner, Pace, ServeError};
 use crate::run::{DEFAULT_BITRATE_BPS, Load, Options, replay};
-use crate::traffic::{Kind, parse_log};
+use cantap_emu::traffic::{Kind, parse_log};
 
 /// Traffic that leaves the emulation close to real time.
 const DEFAULT_LOAD_PERCENT: f64 = 20.0;
@@ -55,7 +56,7 @@ pub enum AddressError {
     },
     /// The file is not a firmware.
     #[error("{0}")]
-    Firmware(#[from] ElfError),
+    Firmware(#[from] FirmwareError),
     /// The firmware does not come up.
     #[error("{0}")]
     Start(#[from] ServeError),
@@ -85,7 +86,7 @@ impl std::str::FromStr for Address {
             let bad =
                 |reason: String| AddressError::Value { key: "log".to_owned(), value: log.to_owned(), reason };
             let text = std::fs::read_to_string(log).map_err(|error| bad(error.to_string()))?;
-            let lines = parse_log(&text, 0).map_err(|error| bad(error.to_string()))?;
+            let lines = parse_log(&text, 0, CLOCK).map_err(|error| bad(error.to_string()))?;
             let bitrate_bps = address.options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
             address.options.load = replay(lines, bitrate_bps).0;
         }
@@ -184,7 +185,7 @@ impl Address {
 
     /// Boots the firmware and opens the device's port.
     pub fn open(self) -> Result<EmulatedPort, AddressError> {
-        let image = Image::open(&self.file)?;
+        let image = firmware::open(&self.file)?;
         Ok(EmulatedPort::start(image, self.options, self.manner)?)
     }
 }
@@ -216,7 +217,7 @@ fn cycles(text: &str) -> Option<u64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::timing::Bound;
+    use cantap_emu::timing::Bound;
 
     #[test]
     fn options_follow_the_file() {

@@ -1,13 +1,14 @@
 //! What the firmware does to a bus, measured on the bus itself: how soon it replies, how well it keeps times, how
 //! much it can send. For tests, which hold it against limits, and for the benchmark, which prints it.
 
+use crate::board::CLOCK;
 use cantap_wire::message::{Checksum, Filter, FrameKind, Modifier, Periodic, Trigger};
 use cantap_wire::{Channel, Command, Frame, Id};
 
 use crate::CYCLES_PER_US;
-use crate::bus::{BitTime, BusFrame, Member, Node};
 use crate::rig::{MS, Rig, RigError};
-use crate::traffic::Script;
+use cantap_emu::bus::{BitTime, BusFrame, Member, Node};
+use cantap_emu::traffic::Script;
 
 const MEGABIT: u32 = 1_000_000;
 const CHANNEL: Channel = Channel::Can1;
@@ -63,7 +64,7 @@ pub fn reply_latency(rig: &mut Rig) -> Result<Option<Range>, RigError> {
     })?;
     let from = rig.now() + MS;
     let calls = (0..CALLS).map(|n| (from + n * EVERY_US * CYCLES_PER_US, call)).collect();
-    let caller = Node::new(BitTime::of_rate(MEGABIT)).with_source(Script::new(calls));
+    let caller = Node::new(BitTime::of_rate(MEGABIT, CLOCK)).with_source(Script::new(calls));
     rig.machine.board().wires[CHANNEL.index()].add(caller);
     let crossed = watch(rig, 2 * MS + CALLS * EVERY_US * CYCLES_PER_US)?;
     let replied = crossed.windows(2).filter(|pair| pair[0].frame == call && pair[1].frame == reply);

@@ -1,48 +1,26 @@
-//! The emulated board: an STM32F405 that runs the unmodified firmware ELF instruction by instruction,
-//! with two CAN buses and a USB host attached.
+//! Our rig on the emulated board: a capture host with its books, drivers for transmission, the addresses that the command
+//! understands, and the board as a USB device for a Linux kernel.
 //!
-//! It depends on the wire protocol's types and never on the firmware's library: it is an independent
-//! witness that sees only the ELF. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]); nothing
-//! here looks at the host's clock, so the same seed gives the same run, byte for byte. How long the core waits for
-//! its memories is one of two bounds ([`timing`]).
+//! The board itself is `cantap-emu`'s and knows nothing of this product; what it must be told of our boards is in [`board`].
+//! Nothing here uses the firmware's library: this is an independent witness that sees only the ELF, and shares the wire protocol's types
+//! with it. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]).
 
 #![forbid(unsafe_code)]
 
 pub mod address;
-pub mod bus;
-pub mod can;
+pub mod board;
 pub mod capture;
-pub mod cpu;
 pub mod drive;
-pub mod elf;
+pub mod firmware;
 pub mod link;
-pub mod machine;
-pub mod memory_map;
-pub mod otg;
-pub mod peripheral;
-pub mod probe;
-pub mod profile;
 #[cfg(unix)]
 pub mod pty;
 pub mod rig;
 pub mod run;
-pub mod soc;
-pub mod stop;
 pub mod stream;
-pub mod timing;
-pub mod trace;
-pub mod traffic;
-pub mod usb;
-pub mod usb_host;
 pub mod usbip;
 
-pub use elf::{ElfError, Image};
-pub use machine::{Machine, Setup};
-pub use peripheral::Peripheral;
-pub use stop::{Reason, Stopped};
-
-/// Core cycles per emulated second: the firmware's SYSCLK of 144 MHz. The few microseconds before the
-/// firmware switches to its PLL are counted in the same unit.
-pub const CYCLES_PER_SECOND: u64 = 144_000_000;
+/// Core cycles per emulated second.
+pub const CYCLES_PER_SECOND: u64 = board::CLOCK.hz();
 /// Core cycles per emulated microsecond.
-pub const CYCLES_PER_US: u64 = CYCLES_PER_SECOND / 1_000_000;
+pub const CYCLES_PER_US: u64 = board::CLOCK.us(1);

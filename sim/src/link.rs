@@ -13,12 +13,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use crate::CYCLES_PER_SECOND;
-use crate::bus::{BitTime, BusFrame};
-use crate::elf::Image;
-use crate::machine::Setup;
+use crate::board::{self, CLOCK};
 use crate::rig::{MS, Rig, RigError};
 use crate::run::{DEFAULT_BITRATE_BPS, Load, Options};
-use crate::traffic::Script;
+use cantap_emu::bus::{BitTime, BusFrame};
+use cantap_emu::elf::Image;
+use cantap_emu::machine::Setup;
+use cantap_emu::traffic::Script;
 use cantap_wire::{CHANNELS, Channel};
 
 /// What happens while the client does not read.
@@ -130,7 +131,7 @@ impl Served {
     /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
     /// of `options` from now on, any other and a replayed log as long as the channel is open.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
-        let setup = Setup { joined: manner.joined, bound: options.bound, ..Setup::default() };
+        let setup = Setup { joined: manner.joined, bound: options.bound, ..board::setup() };
         let mut rig = Rig::new(image, setup, options.timing);
         rig.plug_in()?;
         let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
@@ -177,9 +178,9 @@ impl Served {
             }
             self.open[channel.index()] = bit;
             let bus_bit = match (self.options.bitrate_bps, bit) {
-                (Some(bitrate_bps), _) => BitTime::of_rate(bitrate_bps),
+                (Some(bitrate_bps), _) => BitTime::of_rate(bitrate_bps, CLOCK),
                 (None, Some(cycles)) => BitTime::of_cycles(cycles),
-                (None, None) => BitTime::of_rate(DEFAULT_BITRATE_BPS),
+                (None, None) => BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK),
             };
             let carries = bit.is_some() && self.options.channels.contains(&channel);
             let now = self.rig.now();

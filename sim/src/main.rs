@@ -7,12 +7,14 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
+use cantap_emu::Image;
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, parse_log};
+use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_SECOND;
-use cantap_sim::elf::{ElfError, Image};
+use cantap_sim::board::CLOCK;
+use cantap_sim::firmware::{self, FirmwareError};
 use cantap_sim::run::{self, Load, Options, Report};
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, parse_log};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
 use clap::{Parser, Subcommand};
 
@@ -167,8 +169,8 @@ fn main() -> ExitCode {
 }
 
 fn open(firmware: &Path) -> anyhow::Result<Image> {
-    Image::open(firmware).map_err(|error| match error {
-        ElfError::Unreadable { .. } => anyhow::anyhow!("{error}"),
+    firmware::open(firmware).map_err(|error| match error {
+        FirmwareError::Unreadable { .. } => anyhow::anyhow!("{error}"),
         _ => anyhow::anyhow!("{}: {error}", firmware.display()),
     })
 }
@@ -214,7 +216,7 @@ fn options(args: &Args) -> anyhow::Result<Options> {
         stall: args.stall,
         seed: args.seed,
         bound: args.timing,
-        timing: Timing::default().behind_hub(args.hub),
+        timing: Timing::new(CLOCK).behind_hub(args.hub),
         trace: args.trace.is_some(),
         profile: args.profile,
         ..Options::default()
@@ -224,7 +226,7 @@ fn options(args: &Args) -> anyhow::Result<Options> {
     if let Some(path) = &args.replay {
         let name = path.display();
         let text = std::fs::read_to_string(path).with_context(|| format!("{name} cannot be read"))?;
-        let lines = parse_log(&text, 0).with_context(|| name.to_string())?;
+        let lines = parse_log(&text, 0, CLOCK).with_context(|| name.to_string())?;
         let (load, cycles) = run::replay(lines, bitrate_bps);
         options.load = load;
         options.seconds = cycles as f64 / CYCLES_PER_SECOND as f64;

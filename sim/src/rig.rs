@@ -3,19 +3,20 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use crate::board::CLOCK;
 use cantap_wire::message::{ChannelConfig, EndReason, Hello, Status};
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Event, Record, Refusal, Reply, Response};
 
-use crate::bus::{BitTime, BusFrame, Node, Source, Wire};
 use crate::capture::{Heard, Ledger, Session};
-use crate::elf::Image;
-use crate::machine::{Machine, Setup};
-use crate::memory_map as map;
-use crate::otg::Otg;
-use crate::stop::Stopped;
-use crate::usb::UsbPort;
-use crate::usb_host::{self, EnumerationError, Timing, UsbHost};
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+use cantap_emu::bus::{BitTime, BusFrame, Node, Source, Wire};
+use cantap_emu::elf::Image;
+use cantap_emu::machine::{Machine, Setup};
+use cantap_emu::memory_map as map;
+use cantap_emu::otg::Otg;
+use cantap_emu::stop::Stopped;
+use cantap_emu::usb::UsbPort;
+use cantap_emu::usb_host::{self, EnumerationError, Timing, UsbHost};
 
 /// Core cycles of a millisecond.
 pub const MS: u64 = 1000 * CYCLES_PER_US;
@@ -185,7 +186,7 @@ impl Rig {
                 watched[number].extend(&history);
             }
             for crossed in history {
-                let bits = u64::from(crate::bus::bits::bus_bits(&crossed.frame));
+                let bits = u64::from(cantap_emu::bus::bits::bus_bits(&crossed.frame));
                 for channel in Channel::ALL {
                     let n = channel.index();
                     if self.booked[n] && crossed.taken_by >> n & 1 != 0 {
@@ -360,7 +361,7 @@ impl Rig {
 
     /// Puts a sender on a channel's bus, and a second node that acknowledges.
     pub fn add_traffic(&mut self, channel: Channel, bitrate_bps: u32, source: impl Source + 'static) {
-        let bit = BitTime::of_rate(bitrate_bps);
+        let bit = BitTime::of_rate(bitrate_bps, CLOCK);
         let wire = &mut self.machine.board().wires[channel.index()];
         wire.add(Node::new(bit).with_source(source));
         wire.add(Node::new(bit));
@@ -432,7 +433,7 @@ impl Rig {
     /// The core cycle of the device's tick 0.
     pub fn clock_origin(&mut self) -> u64 {
         let now = self.now();
-        self.machine.board().stamp_timer_origin(now)
+        self.machine.board().tim2_origin(now)
     }
 
     /// The bytes kept so far.

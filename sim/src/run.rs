@@ -3,22 +3,23 @@
 
 use std::time::{Duration, Instant};
 
+use crate::board::{self, CAPTURE_IRQS, CLOCK};
 use cantap_wire::{CHANNELS, Channel, Frame};
 use serde_json::{Value, json};
 
-use crate::bus::Source;
-use crate::bus::bits::bus_bits;
 use crate::capture::{Losses, Stamps};
-use crate::elf::Image;
-use crate::machine::{Machine, Setup};
-use crate::profile::Table;
 use crate::rig::{MS, Rig, RigError};
-use crate::soc::{CAPTURE_IRQS, OddAccess};
-use crate::timing::Bound;
-use crate::trace::Trace;
-use crate::traffic::{Bursts, Kind, Script, Traffic};
-use crate::usb_host::Timing;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+use cantap_emu::bus::Source;
+use cantap_emu::bus::bits::bus_bits;
+use cantap_emu::elf::Image;
+use cantap_emu::machine::{Machine, Setup};
+use cantap_emu::profile::Table;
+use cantap_emu::soc::OddAccess;
+use cantap_emu::timing::Bound;
+use cantap_emu::trace::Trace;
+use cantap_emu::traffic::{Bursts, Kind, Script, Traffic};
+use cantap_emu::usb_host::Timing;
 
 /// The fastest bit rate of classical CAN, in bit/s.
 pub const DEFAULT_BITRATE_BPS: u32 = 1_000_000;
@@ -88,7 +89,7 @@ impl Default for Options {
             bitrate_bps: None,
             stall: None,
             seed: 1,
-            timing: Timing::default(),
+            timing: Timing::new(CLOCK),
             bound: Bound::default(),
             trace: false,
             profile: false,
@@ -153,7 +154,7 @@ pub struct Report {
 /// Runs `image` and captures from it.
 pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, Trace)>), RigError> {
     let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
-    let setup = Setup { bound: options.bound, ..Setup::default() };
+    let setup = Setup { bound: options.bound, ..board::setup() };
     let mut rig = Rig::new(image, setup, options.timing);
     let hello = rig.connect()?;
     for channel in &options.channels {

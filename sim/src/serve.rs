@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use cantap_sim::elf::Image;
+use cantap_emu::elf::Image;
 use cantap_sim::run::Options;
 
 #[cfg(unix)]

@@ -3,15 +3,16 @@
 
 use std::collections::VecDeque;
 
+use crate::board::CLOCK;
 use cantap_wire::message::{ChannelConfig, MAX_SEND, Mode, TxFrame};
 use cantap_wire::{CHANNELS, Channel, Command, Event};
 
-use crate::bus::bits::bus_bits;
-use crate::bus::{BitTime, BusFrame, Member, Node};
 use crate::drive::Range;
 use crate::rig::{MS, Rig, RigError, timing};
-use crate::traffic::{Frames, Kind};
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+use cantap_emu::bus::bits::bus_bits;
+use cantap_emu::bus::{BitTime, BusFrame, Member, Node};
+use cantap_emu::traffic::{Frames, Kind};
 
 const MEGABIT: u32 = 1_000_000;
 /// The device's clock.
@@ -59,7 +60,7 @@ pub fn join(rig: &mut Rig, channels: &[Channel]) -> Result<(), RigError> {
     for &channel in channels {
         let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing(MEGABIT)?) };
         rig.open(channel, config)?;
-        rig.machine.board().wires[channel.index()].add(Node::new(BitTime::of_rate(MEGABIT)));
+        rig.machine.board().wires[channel.index()].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     }
     Ok(())
 }
@@ -207,7 +208,7 @@ pub fn fill(
     kind: Kind,
     seconds: f64,
 ) -> Result<Option<Vec<Filled>>, RigError> {
-    let bit = BitTime::of_rate(MEGABIT);
+    let bit = BitTime::of_rate(MEGABIT, CLOCK);
     let mut plans: [Vec<TxFrame>; CHANNELS] = Default::default();
     for &channel in channels {
         let (mut frames, mut bits) = (Frames::new(kind, 3 + channel.index() as u64), 0);

@@ -5,10 +5,12 @@ mod common;
 
 use std::sync::{Arc, Mutex};
 
-use cantap_sim::memory_map::{FLASH, OTG_FS, OTG_FS_IRQ, SRAM};
-use cantap_sim::usb::UsbPort;
-use cantap_sim::usb_host::Timing;
-use cantap_sim::{Image, Machine, Setup};
+use cantap_emu::memory_map::{FLASH, OTG_FS, OTG_FS_IRQ, SRAM};
+use cantap_emu::usb::UsbPort;
+use cantap_emu::usb_host::Timing;
+use cantap_emu::{Image, Machine, Setup};
+use cantap_sim::board::{self, CLOCK};
+use cantap_sim::firmware;
 use fastrand::Rng;
 
 /// Random halfwords, and stores to random registers of known peripherals among them.
@@ -71,9 +73,9 @@ fn no_program_brings_the_emulator_down() {
     let mut random = Rng::with_seed(4);
     let mut ended = 0;
     for _ in 0..2000 {
-        let setup = Setup { survive_watchdog: true, joined: random.bool(), ..Setup::default() };
+        let setup = Setup { survive_watchdog: true, joined: random.bool(), ..board::setup() };
         let mut machine = Machine::new(random_program(&mut random), setup);
-        let mut usb = UsbPort::new(Timing::default());
+        let mut usb = UsbPort::new(Timing::new(CLOCK));
         usb.host(0).0.plug();
         machine.attach(OTG_FS, OTG_FS_IRQ, Arc::new(Mutex::new(usb)));
         ended += u32::from(machine.run_until(30_000).is_err());
@@ -100,9 +102,9 @@ fn no_damaged_elf_brings_the_loader_down() {
                 *byte = random.u8(..);
             }
         }
-        match Image::firmware(&bytes) {
+        match firmware::read(&bytes) {
             Ok(image) => {
-                let mut machine = Machine::new(image, Setup::default());
+                let mut machine = Machine::new(image, board::setup());
                 let _ = machine.run_until(20_000);
             }
             Err(error) => {

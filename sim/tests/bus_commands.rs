@@ -2,14 +2,15 @@
 
 mod common;
 
-use cantap_sim::bus::{BitTime, Node};
+use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, Script, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::drive;
-use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_sim::stream::join;
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, Script, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind};
 use cantap_wire::{Channel, Command, Event, Frame};
 
@@ -22,7 +23,7 @@ fn connected() -> Option<Rig> {
 
 /// A board under a bound of time.
 fn connected_under(bound: Bound) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup { bound, ..Setup::default() }, Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, Setup { bound, ..board::setup() }, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     Some(rig)
 }
@@ -108,8 +109,8 @@ fn hardware_filters_accept_and_reject() {
             texts.iter().zip(0..).map(|(text, n)| (from + n * MS / 4, text.parse().unwrap())).collect();
         let mut board = rig.machine.board();
         let wire = &mut board.wires[channel.index()];
-        wire.add(Node::new(BitTime::of_rate(MEGABIT)));
-        wire.add(Node::new(BitTime::of_rate(MEGABIT)).with_source(Script::new(frames)));
+        wire.add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
+        wire.add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)).with_source(Script::new(frames)));
         drop(board);
         rig.run_for(6 * MS).unwrap();
         let status = rig.status().unwrap().channels[channel.index()];
@@ -127,7 +128,7 @@ fn every_cia_rate_is_heard_and_its_double_is_not() {
         let ms = 12_000_000 / u64::from(rate) + 4;
         let traffic = Traffic::new(Kind::Mix, u64::from(rate), 80.0, from, from + 3 * ms * MS);
         if added {
-            rig.change_traffic(Can1, BitTime::of_rate(rate), Some(Box::new(traffic)));
+            rig.change_traffic(Can1, BitTime::of_rate(rate, CLOCK), Some(Box::new(traffic)));
         } else {
             rig.add_traffic(Can1, rate, traffic);
             added = true;

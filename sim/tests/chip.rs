@@ -2,11 +2,12 @@
 
 mod common;
 
+use cantap_emu::machine::Setup;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_SECOND;
-use cantap_sim::machine::Setup;
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig, RigError};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{Filter, FrameKind, MAX_FILTERS};
 use cantap_wire::{Channel, Command};
 
@@ -17,7 +18,7 @@ const STACK_LEN: usize = 24 * 1024;
 const ROM_ENTRY: u32 = 0x1FFF_3DA5;
 
 fn connected(setup: Setup) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, setup, Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, setup, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     Some(rig)
 }

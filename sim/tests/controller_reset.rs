@@ -3,12 +3,13 @@
 
 mod common;
 
-use cantap_sim::bus::{BitTime, Node};
-use cantap_sim::can::MasterReset;
-use cantap_sim::machine::Setup;
+use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::can::MasterReset;
+use cantap_emu::machine::Setup;
+use cantap_emu::traffic::{Kind, Script, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, timing};
-use cantap_sim::traffic::{Kind, Script, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, TxFrame};
 use cantap_wire::{Channel, Command, Event, Frame};
 
@@ -35,7 +36,8 @@ fn hold(rig: &mut Rig, hold: bool) {
 }
 
 fn stuck_and_closed(master_reset: MasterReset) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup { master_reset, ..Setup::default() }, Timing::hasty());
+    let mut rig =
+        Rig::new(common::firmware()?, Setup { master_reset, ..board::setup() }, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     for (channel, id) in [(Can1, 0x123), (Can2, 0x200)] {
         rig.ask(Command::SetFilters { channel, filters: [filter(id)].into_iter().collect() }).unwrap();
@@ -90,8 +92,8 @@ fn nothing_of_before_is_sent_and_the_filters_stand_after_a_reset() {
         rig.watch();
         let from = some_frames(&rig, [0x123, 0x124, 0x123]);
         let mut board = rig.machine.board();
-        board.wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
-        board.wires[0].add(Node::new(BitTime::of_rate(MEGABIT)).with_source(Script::new(from)));
+        board.wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
+        board.wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)).with_source(Script::new(from)));
         drop(board);
         let before = rig.status().unwrap().channels[0].frames;
         rig.ask(Command::Open { channel: Can1, config: Some(config(Mode::Normal)) }).unwrap();
@@ -110,8 +112,8 @@ fn nothing_of_before_is_sent_and_the_filters_stand_after_a_reset() {
 #[test]
 fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
     let Some(image) = common::firmware() else { return };
-    let setup = Setup { master_reset: MasterReset::Least, ..Setup::default() };
-    let mut rig = Rig::new(image, setup, Timing::hasty());
+    let setup = Setup { master_reset: MasterReset::Least, ..board::setup() };
+    let mut rig = Rig::new(image, setup, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     rig.ask(Command::Open { channel: Can1, config: Some(config(Mode::Normal)) }).unwrap();
     rig.listen(Can2, MEGABIT).unwrap();

@@ -3,9 +3,10 @@
 
 mod common;
 
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::{Outcome, Request as UsbRequest, Timing};
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig, timing};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::{Outcome, Request as UsbRequest, Timing};
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, MAX_FILTERS, Mode, Periodic, Trigger, TxFrame};
 use cantap_wire::{Channel, Command, Frame, Id, PROTOCOL_VERSION, Refusal, Reply};
 
@@ -13,7 +14,7 @@ const MEGABIT: u32 = 1_000_000;
 const CAN1: Channel = Channel::Can1;
 
 fn connected() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty(CLOCK));
     rig.connect().unwrap();
     Some(rig)
 }

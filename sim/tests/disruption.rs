@@ -4,10 +4,11 @@
 
 mod common;
 
-use cantap_sim::otg::Misuse;
+use cantap_emu::otg::Misuse;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::{Status, Timing, UsbHost};
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::{Status, Timing, UsbHost};
 use cantap_wire::message::EndReason;
 use cantap_wire::{Channel, Command};
 
@@ -72,7 +73,7 @@ impl Disruption {
 
 /// A board on a host that resets a new device twice, or once.
 fn board(second_reset: bool) -> Option<Rig> {
-    let timing = Timing { second_reset, ..Timing::hasty() };
+    let timing = Timing { second_reset, ..Timing::hasty(CLOCK) };
     let mut rig = Rig::new(common::firmware()?, common::setup(), timing);
     rig.plug_in().unwrap();
     let from = rig.now();
@@ -142,7 +143,7 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
 fn an_enumeration_may_be_cut_off_anywhere() {
     let Some(image) = common::firmware() else { return };
     let mut random = fastrand::Rng::with_seed(7);
-    let mut rig = Rig::new(image, common::setup(), Timing::hasty());
+    let mut rig = Rig::new(image, common::setup(), Timing::hasty(CLOCK));
     rig.with_host(|host, _| host.plug());
     for _ in 0..30 {
         rig.run_for(random.u64(..60 * MS)).unwrap();

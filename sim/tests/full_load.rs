@@ -5,11 +5,12 @@ mod common;
 
 use std::time::Duration;
 
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_sim::run::{Load, Options, Report, run};
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
 use cantap_wire::message::ChannelConfig;
 
@@ -87,7 +88,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
         (Kind::Ext8, false),
     ] {
         let Some(image) = common::firmware() else { return };
-        let mut rig = Rig::new(image, common::setup(), Timing::hasty());
+        let mut rig = Rig::new(image, common::setup(), Timing::hasty(CLOCK));
         rig.connect().unwrap();
         let listen = ChannelConfig::listen_only(timing(MEGABIT).unwrap());
         let from = rig.now() + 2 * MS;

@@ -3,11 +3,12 @@
 
 mod common;
 
-use cantap_sim::bus::{BitTime, Disturbance, Node};
-use cantap_sim::machine::Setup;
+use cantap_emu::bus::{BitTime, Disturbance, Node};
+use cantap_emu::machine::Setup;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig, timing};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap_wire::record::{ErrorState, TransmitFailure};
@@ -17,7 +18,7 @@ const MEGABIT: u32 = 1_000_000;
 use Channel::{Can1, Can2};
 
 fn connected(setup: Setup) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, setup, Timing::default());
+    let mut rig = Rig::new(common::firmware()?, setup, Timing::new(CLOCK));
     rig.connect().unwrap();
     Some(rig)
 }
@@ -120,7 +121,7 @@ fn sending_while_the_other_channel_is_full_costs_no_frame() {
 fn a_timed_frame_starts_at_its_tick() {
     let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, normal()).unwrap();
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     let Reply::Time(ticks) = rig.ask(Command::Time).unwrap() else { panic!("a time") };
     let at = ticks + 12 * 20_000;
     let timed = TxFrame { frame: frame("123#AB"), tag: 7, at_ticks: Some(at) };
@@ -129,7 +130,7 @@ fn a_timed_frame_starts_at_its_tick() {
     assert_eq!(confirmed(&rig), [7]);
     let end = rig.events().iter().find(|(_, event)| matches!(event, Event::Transmitted { .. })).unwrap().0;
     // 58 bits without intermission, less a little; what remains is the interrupt's latency.
-    let bits = u64::from(cantap_sim::bus::bits::bus_bits(&frame("123#AB"))) - 3;
+    let bits = u64::from(cantap_emu::bus::bits::bus_bits(&frame("123#AB"))) - 3;
     let late = end as f64 / 12.0 - at as f64 / 12.0 - bits as f64;
     assert!((0.0..6.0).contains(&late), "{late} us");
     settle(&mut rig);
@@ -139,7 +140,7 @@ fn a_timed_frame_starts_at_its_tick() {
 fn one_shot_frames_report_what_stopped_them() {
     let Some(mut rig) = connected(common::setup()) else { return };
     rig.open(Can1, ChannelConfig { one_shot: true, ..normal() }).unwrap();
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     rig.machine.board().wires[0].disturb(0, Disturbance::Bit { index: 25 });
     send(&mut rig, Can1, 1, &["123#"]);
     rig.run_for(5 * MS).unwrap();
@@ -147,7 +148,7 @@ fn one_shot_frames_report_what_stopped_them() {
     // Against a bus full of lower identifiers.
     let from = rig.now();
     let frames = (0..200).map(|n| (from + n, frame("001#"))).collect();
-    rig.add_traffic(Can1, MEGABIT, cantap_sim::traffic::Script::new(frames));
+    rig.add_traffic(Can1, MEGABIT, cantap_emu::traffic::Script::new(frames));
     rig.run_for(MS).unwrap();
     send(&mut rig, Can1, 2, &["700#"]);
     rig.run_for(20 * MS).unwrap();
@@ -161,7 +162,7 @@ fn bus_off_is_reported_and_left_as_configured() {
     for manual_recovery in [false, true] {
         let Some(mut rig) = connected(common::setup()) else { return };
         rig.open(Can1, ChannelConfig { manual_recovery, ..normal() }).unwrap();
-        rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
+        rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
         for n in 0..32 {
             rig.machine.board().wires[0].disturb(n, Disturbance::Bit { index: 25 });
         }
@@ -195,7 +196,7 @@ fn a_lone_node_floods_nobody() {
     let per_second = (rig.session.bytes() - bytes) * 10 / 3;
     assert!(per_second < 50_000, "{per_second} bytes/s of error reports");
     assert!(rig.status().is_ok());
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     rig.run_for(10 * MS).unwrap();
     assert_eq!(confirmed(&rig), [1]);
     settle(&mut rig);
@@ -217,7 +218,7 @@ fn a_stuck_bus_hangs_nothing() {
         rig.request(Command::Close { channel }).unwrap();
         rig.open(channel, normal()).unwrap();
     }
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT)));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     send(&mut rig, Can1, 3, &["123#55"]);
     rig.run_for(10 * MS).unwrap();
     assert_eq!(confirmed(&rig), [3]);

@@ -4,11 +4,11 @@
 mod common;
 
 use Channel::{Can1, Can2};
-use cantap_sim::bus::{BitTime, Node};
-use cantap_sim::machine::Setup;
+use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, timing};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, Periodic, Trigger, TxFrame};
 use cantap_wire::record::TransmitFailure;
 use cantap_wire::{Channel, Command, Event, Frame};
@@ -23,7 +23,7 @@ const STORM: u64 = 100 * MS;
 const ANSWERED_WITHIN: u64 = 30 * MS;
 
 fn connected() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, board::setup(), Timing::hasty(CLOCK));
     rig.connect().unwrap();
     Some(rig)
 }
@@ -32,7 +32,7 @@ fn open_normal(rig: &mut Rig, channel: Channel, acknowledged: bool) {
     let config = ChannelConfig { mode: Mode::Normal, ..ChannelConfig::listen_only(timing(MEGABIT).unwrap()) };
     rig.ask(Command::Open { channel, config: Some(config) }).unwrap();
     if acknowledged {
-        rig.machine.board().wires[channel.index()].add(Node::new(BitTime::of_rate(MEGABIT)));
+        rig.machine.board().wires[channel.index()].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)));
     }
 }
 

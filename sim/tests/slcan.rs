@@ -3,20 +3,21 @@
 
 mod common;
 
-use cantap_sim::bus::{BitTime, Node};
+use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::soc::CAN_IRQS;
+use cantap_emu::traffic::{Kind, Script, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::CLOCK;
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::soc::CAN_IRQS;
-use cantap_sim::traffic::{Kind, Script, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::Frame;
 
 const BITRATE_BPS: u32 = 500_000;
 
 /// A board with its port open, and a node that acknowledges on channel 1's bus.
 fn plugged_in() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, common::setup(), Timing::hasty(CLOCK));
     rig.plug_in().unwrap();
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(BITRATE_BPS)));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(BITRATE_BPS, CLOCK)));
     Some(rig)
 }
 
@@ -36,7 +37,7 @@ fn converse(rig: &mut Rig, lines: &[(&str, &str)]) {
 fn on_the_bus(rig: &mut Rig, frames: &[&str]) {
     let from = rig.now() + MS / 2;
     let frames = frames.iter().zip(0..).map(|(text, n)| (from + n * MS, text.parse::<Frame>().unwrap()));
-    let sender = Node::new(BitTime::of_rate(BITRATE_BPS)).with_source(Script::new(frames.collect()));
+    let sender = Node::new(BitTime::of_rate(BITRATE_BPS, CLOCK)).with_source(Script::new(frames.collect()));
     rig.machine.board().wires[0].add(sender);
 }
 
@@ -174,7 +175,7 @@ fn an_overrun_sets_the_data_overrun_flag_once() {
     converse(&mut rig, &[("\rS6\r", "\r\r"), ("L\r", "\r"), ("F\r", "F00\r")]);
     let (from, until) = (rig.now(), rig.now() + 4 * MS);
     let traffic = Traffic::new(Kind::Std0, 1, 100.0, from, until);
-    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(BITRATE_BPS)).with_source(traffic));
+    rig.machine.board().wires[0].add(Node::new(BitTime::of_rate(BITRATE_BPS, CLOCK)).with_source(traffic));
     rig.machine.hold_lines(1 << CAN_IRQS[0][1]);
     rig.run_unbooked(MS).unwrap();
     rig.machine.hold_lines(0);
@@ -194,7 +195,7 @@ mod peers {
     use std::sync::atomic::{AtomicBool, Ordering};
     use std::{io, thread};
 
-    use cantap_sim::bus::Member;
+    use cantap_emu::bus::Member;
     use cantap_sim::link::{Client, Manner, Served};
     use cantap_sim::pty::Pty;
     use cantap_sim::run::{Load, Options};

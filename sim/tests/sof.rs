@@ -2,10 +2,10 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
+use cantap_emu::traffic::{Kind, Traffic as Load};
+use cantap_emu::usb_host::{Timing, UsbHost};
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::traffic::{Kind, Traffic as Load};
-use cantap_sim::usb_host::{Timing, UsbHost};
 use cantap_wire::{Channel, Event};
 
 const MEGABIT: u32 = 1_000_000;
@@ -13,7 +13,7 @@ const MEGABIT: u32 = 1_000_000;
 const TICK: u64 = 12;
 
 fn connected(timing: Timing) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), timing);
+    let mut rig = Rig::new(common::firmware()?, board::setup(), timing);
     rig.connect().unwrap();
     Some(rig)
 }
@@ -43,7 +43,7 @@ fn check(rig: &mut Rig, timing: &Timing, least: usize) {
 /// Over the wrap of the frame number, with a board that is 80 ppm fast and a host whose frames jitter by 500 ns.
 #[test]
 fn an_idle_session_has_exact_marks_once_a_second() {
-    let timing = Timing { board_ppm: 80.0, sof_jitter: 72, ..Timing::hasty() };
+    let timing = Timing { board_ppm: 80.0, sof_jitter: 72, ..Timing::hasty(CLOCK) };
     let Some(mut rig) = connected(timing) else { return };
     rig.run_for(3_200 * MS).unwrap();
     check(&mut rig, &timing, 4);
@@ -57,7 +57,7 @@ fn an_idle_session_has_exact_marks_once_a_second() {
 /// Both buses full, and the millisecond tick with all there is to do.
 #[test]
 fn marks_are_exact_beside_two_full_buses() {
-    let timing = Timing { board_ppm: -80.0, sof_jitter: 72, ..Timing::hasty() };
+    let timing = Timing { board_ppm: -80.0, sof_jitter: 72, ..Timing::hasty(CLOCK) };
     let Some(mut rig) = connected(timing) else { return };
     rig.run_for(940 * MS).unwrap();
     for channel in Channel::ALL {
@@ -81,7 +81,7 @@ fn marks_are_exact_beside_two_full_buses() {
 /// A suspended bus has no frames. The session after it begins with a new mark.
 #[test]
 fn a_suspended_bus_makes_no_marks() {
-    let timing = Timing::hasty();
+    let timing = Timing::hasty(CLOCK);
     let Some(mut rig) = connected(timing) else { return };
     rig.run_for(100 * MS).unwrap();
     rig.with_host(|host, _| host.suspend());

@@ -1,18 +1,20 @@
 //! How the firmware starts: after power-on, behind the ROM bootloader, with a crystal that is slow or broken, and after a run
 //! that failed.
 
+#[path = "../emu/tests/assembly/mod.rs"]
 mod assembly;
 mod common;
 
 use assembly::{Program, ldr, movs, str};
+use cantap_emu::machine::{Machine, Setup};
+use cantap_emu::memory_map::{FLASH, SRAM};
+use cantap_emu::soc::rcc::{CRYSTAL_START_US, Crystal};
+use cantap_emu::soc::rom::{self, Start};
+use cantap_emu::stop::Reason;
+use cantap_emu::usb_host::Timing;
 use cantap_sim::CYCLES_PER_US;
-use cantap_sim::machine::{Machine, Setup};
-use cantap_sim::memory_map::{FLASH, SRAM};
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, RigError};
-use cantap_sim::soc::rcc::{CRYSTAL_START, Crystal};
-use cantap_sim::soc::rom::{self, Start};
-use cantap_sim::stop::Reason;
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{ChannelConfig, Failures};
 use cantap_wire::{Channel, Command, Reply};
 use common::BOARDS;
@@ -24,16 +26,16 @@ const AFRL: u32 = 0x20;
 const AF_CAN: u32 = 9;
 
 fn crystal(hz: u64) -> Crystal {
-    Crystal { hz, start: Some(CRYSTAL_START) }
+    Crystal { hz, start_us: Some(CRYSTAL_START_US) }
 }
 
 fn behind_the_bootloader(hz: u64) -> Setup {
-    Setup { start: Start::Bootloader, crystal: crystal(hz), ..Setup::default() }
+    Setup { start: Start::Bootloader, crystal: crystal(hz), ..board::setup() }
 }
 
 /// A rig whose firmware is up and greeted, or none without a firmware.
 fn connected(name: &str, setup: Setup) -> Option<Rig> {
-    let mut rig = Rig::new(common::board(name)?, setup, Timing::hasty());
+    let mut rig = Rig::new(common::board(name)?, setup, Timing::hasty(CLOCK));
     rig.connect().unwrap_or_else(|error| panic!("{name}: {error}"));
     Some(rig)
 }
@@ -54,7 +56,7 @@ fn every_board_starts_behind_the_rom_bootloader() {
 #[test]
 fn the_bootloaders_usb_device_goes_before_ours_comes() {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, behind_the_bootloader(8_000_000), Timing::hasty());
+    let mut rig = Rig::new(image, behind_the_bootloader(8_000_000), Timing::hasty(CLOCK));
     rig.with_host(|host, _| host.plug());
     rig.machine.run_until(1).unwrap();
     assert!(rig.with_host(|_, otg| otg.pulled_up(true)), "the bootloader's device is there");
@@ -78,7 +80,7 @@ fn defaults_are_saved_behind_the_bootloader() {
 
 #[test]
 fn defaults_are_saved_whatever_error_the_flash_shows() {
-    save_defaults(Setup::default(), |rig| rig.machine.board().leave_flash_error());
+    save_defaults(board::setup(), |rig| rig.machine.board().leave_flash_error());
 }
 
 fn save_defaults(setup: Setup, before: fn(&mut Rig)) {
@@ -95,7 +97,7 @@ fn save_defaults(setup: Setup, before: fn(&mut Rig)) {
 
 #[test]
 fn the_rom_bootloader_finds_its_memory_at_zero_and_its_vectors_there() {
-    let Some(mut rig) = connected("olimex-p405", Setup::default()) else { return };
+    let Some(mut rig) = connected("olimex-p405", board::setup()) else { return };
     rig.ask(Command::Bootloader).unwrap();
     let Err(RigError::Stopped(stopped)) = rig.run_for(100 * MS) else { panic!("it goes on") };
     assert_eq!(stopped.reason, Reason::Bootloader);
@@ -120,7 +122,7 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
         program.put(&[str(3, 2, 0)]);
         let end = program.here();
         program.branch_to(end);
-        let mut machine = Machine::new(program.image(), Setup::default());
+        let mut machine = Machine::new(program.image(), board::setup());
         machine.run_until(100).unwrap();
         let board = machine.board();
         (board.memory_at_zero(), board.odd_accesses().len())
@@ -135,7 +137,7 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
 #[test]
 fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
     for (name, hz, pins) in BOARDS {
-        let setup = Setup { crystal: crystal(hz), ..Setup::default() };
+        let setup = Setup { crystal: crystal(hz), ..board::setup() };
         let Some(mut rig) = connected(name, setup) else { return };
         rig.run_for(MS).unwrap();
         for (port, pin) in pins {
@@ -150,22 +152,22 @@ fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
 
 #[test]
 fn a_debugger_keeps_its_connection_while_the_processor_sleeps() {
-    let Some(rig) = connected("olimex-p405", Setup::default()) else { return };
+    let Some(rig) = connected("olimex-p405", board::setup()) else { return };
     assert_eq!(rig.machine.board().debug_control() & 1, 1);
 }
 
 /// The firmware waits 100 ms of HSI; the emulator's time passes at 144 MHz, where those cycles are 15.
 #[test]
 fn a_crystal_that_is_slow_is_waited_for() {
-    let slow = Crystal { hz: 8_000_000, start: Some(5 * CRYSTAL_START) };
-    connected("olimex-p405", Setup { crystal: slow, ..Setup::default() });
+    let slow = Crystal { hz: 8_000_000, start_us: Some(5 * CRYSTAL_START_US) };
+    connected("olimex-p405", Setup { crystal: slow, ..board::setup() });
 }
 
 #[test]
 fn a_crystal_that_does_not_start_is_told_by_the_led_and_tried_again() {
     let Some(image) = common::firmware() else { return };
-    let broken = Crystal { hz: 8_000_000, start: None };
-    let mut rig = Rig::new(image, Setup { crystal: broken, ..Setup::default() }, Timing::hasty());
+    let broken = Crystal { hz: 8_000_000, start_us: None };
+    let mut rig = Rig::new(image, Setup { crystal: broken, ..board::setup() }, Timing::hasty(CLOCK));
     // A millisecond of the firmware, which runs from HSI: 16 000 cycles, which its waiting loop makes a third more here.
     let ms = 21_333;
     // How long it was dark before each flash.
@@ -228,7 +230,7 @@ fn fail_once(rig: &mut Rig, target: u32) {
 
 #[test]
 fn the_last_failure_outlives_the_restart_and_can_be_asked_for() {
-    let setup = Setup { survive_failures: true, survive_watchdog: true, ..Setup::default() };
+    let setup = Setup { survive_failures: true, survive_watchdog: true, ..board::setup() };
     let Some(mut rig) = connected("olimex-p405", setup) else { return };
     assert_eq!(failures(&mut rig), Failures::default());
 

@@ -1,13 +1,17 @@
 //! Runs that end before their time: each says why, where, and who called.
 
+#[path = "../emu/tests/assembly/mod.rs"]
 mod assembly;
 mod common;
 
 use assembly::{EQ, Program, adds, cmp, ldr, movs, nop, str, udf, wfi};
-use cantap_sim::memory_map::{CCM, FLASH, SRAM};
+use cantap_emu::memory_map::{CCM, FLASH, SRAM};
+use cantap_emu::usb_host::Timing;
+use cantap_emu::{ElfError, Image, Machine, Reason, Setup, Stopped};
+use cantap_sim::CYCLES_PER_SECOND;
+use cantap_sim::board::{self, CLOCK};
+use cantap_sim::firmware::{self, FirmwareError};
 use cantap_sim::rig::{Rig, RigError};
-use cantap_sim::usb_host::Timing;
-use cantap_sim::{CYCLES_PER_SECOND, ElfError, Image, Machine, Reason, Setup, Stopped};
 use cantap_wire::Command;
 
 const SECOND: u64 = CYCLES_PER_SECOND;
@@ -26,7 +30,7 @@ fn an_undefined_instruction_is_a_hard_fault_at_its_address() {
     program.put(&[nop(), nop()]);
     let fault = program.here();
     program.put(&[udf()]);
-    let stopped = stop(program, Setup::default());
+    let stopped = stop(program, board::setup());
     assert!(matches!(stopped.reason, Reason::HardFault([cfsr, ..]) if cfsr & 1 << 16 != 0), "{stopped}");
     assert_eq!(stopped.pc, fault);
 }
@@ -37,7 +41,7 @@ fn an_access_to_nowhere_tells_its_address() {
     program.handler(1);
     program.load(0, CCM.end);
     program.put(&[str(0, 0, 0)]);
-    let stopped = stop(program, Setup::default());
+    let stopped = stop(program, board::setup());
     assert!(matches!(stopped.reason, Reason::HardFault([_, _, _, bfar]) if bfar == CCM.end), "{stopped}");
 }
 
@@ -57,11 +61,11 @@ fn an_unfed_watchdog_ends_the_run_or_restarts_the_firmware() {
         program.branch_to(sleep);
         program
     };
-    let stopped = stop(program(), Setup::default());
+    let stopped = stop(program(), board::setup());
     assert_eq!(stopped.reason, Reason::Watchdog);
     // 4 × 4096 ticks of 32 kHz.
     assert_eq!(stopped.at / (SECOND / 1000), 512);
-    let mut machine = Machine::new(program().image(), Setup { survive_watchdog: true, ..Setup::default() });
+    let mut machine = Machine::new(program().image(), Setup { survive_watchdog: true, ..board::setup() });
     machine.run_until(2 * SECOND).unwrap();
     assert_eq!((machine.resets(), machine.cpu().word(SRAM.start)), (3, Some(4)));
 }
@@ -85,8 +89,8 @@ fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
         program.branch_to(wait);
         program
     };
-    assert_eq!(stop(program(), Setup { stop_on_reset: true, ..Setup::default() }).reason, Reason::Reset);
-    let mut machine = Machine::new(program().image(), Setup::default());
+    assert_eq!(stop(program(), Setup { stop_on_reset: true, ..board::setup() }).reason, Reason::Reset);
+    let mut machine = Machine::new(program().image(), board::setup());
     machine.run_until(SECOND).unwrap();
     assert_eq!((machine.resets(), machine.cpu().word(SRAM.start)), (2, Some(3)));
     assert!(machine.cpu().asleep());
@@ -95,7 +99,7 @@ fn a_requested_reset_restarts_the_firmware_unless_told_otherwise() {
 /// The firmware with one exception's vector bent to `target`, until it ends there.
 fn bend(number: u32, target: impl Fn(&Image) -> u32) -> Option<(Image, Stopped)> {
     let image = common::firmware()?;
-    let mut rig = Rig::new(image.clone(), common::setup(), Timing::default());
+    let mut rig = Rig::new(image.clone(), common::setup(), Timing::new(CLOCK));
     rig.connect().unwrap();
     let vector = FLASH.start + 4 * number;
     let bent = (target(&image) | 1).to_le_bytes();
@@ -128,7 +132,7 @@ fn a_fault_in_the_firmware_names_the_function_and_its_callers() {
 #[test]
 fn entering_the_rom_bootloader_ends_the_run() {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, common::setup(), Timing::default());
+    let mut rig = Rig::new(image, common::setup(), Timing::new(CLOCK));
     rig.connect().unwrap();
     let (_, bytes) = rig.session.request(Command::Bootloader);
     rig.with_host(|host, _| host.send(&bytes));
@@ -158,14 +162,20 @@ fn a_file_that_cannot_run_is_refused_in_one_line() {
         }
         bytes
     };
-    assert!(matches!(Image::firmware(b"#!/bin/sh\n"), Err(ElfError::NotElf)));
-    assert!(matches!(Image::firmware(&elf(X86_64, FLASH.start)), Err(ElfError::OtherMachine { .. })));
-    assert!(matches!(Image::firmware(&elf(ARM, 0x1_0000)), Err(ElfError::OtherMemoryMap { .. })));
-    assert!(matches!(Image::firmware(&elf(ARM, FLASH.start)), Err(ElfError::NoProtocolVersion)));
+    assert!(matches!(firmware::read(b"#!/bin/sh\n"), Err(FirmwareError::Elf { source: ElfError::NotElf })));
+    assert!(matches!(
+        firmware::read(&elf(X86_64, FLASH.start)),
+        Err(FirmwareError::Elf { source: ElfError::OtherMachine { .. } })
+    ));
+    assert!(matches!(
+        firmware::read(&elf(ARM, 0x1_0000)),
+        Err(FirmwareError::Elf { source: ElfError::OtherMemoryMap { .. } })
+    ));
+    assert!(matches!(firmware::read(&elf(ARM, FLASH.start)), Err(FirmwareError::NoProtocolVersion)));
     for bytes in [b"#!/bin/sh\n".to_vec(), elf(X86_64, FLASH.start), elf(ARM, 0), elf(ARM, FLASH.start)] {
-        let message = Image::firmware(&bytes).unwrap_err().to_string();
+        let message = firmware::read(&bytes).unwrap_err().to_string();
         assert!(!message.contains('\n') && message.len() > 20, "{message}");
     }
-    let newer = ElfError::ProtocolMismatch { firmware: cantap_wire::PROTOCOL_VERSION + 1 };
+    let newer = FirmwareError::ProtocolMismatch { firmware: cantap_wire::PROTOCOL_VERSION + 1 };
     assert!(newer.to_string().ends_with("update the emulator"));
 }

@@ -3,12 +3,13 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
+use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound::{self, Best, Worst};
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::stream::{Replayed, fill, join, replay};
-use cantap_sim::timing::Bound::{self, Best, Worst};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel::{Can1, Can2};
 use cantap_wire::message::{MAX_SEND, TxFrame};
 use cantap_wire::{Channel, Command, Event};
@@ -22,7 +23,7 @@ fn joined(channels: &[Channel]) -> Option<Rig> {
 
 /// The same under a bound of time.
 fn joined_under(bound: Bound, channels: &[Channel]) -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup { bound, ..Setup::default() }, Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, Setup { bound, ..board::setup() }, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     join(&mut rig, channels).unwrap();
     Some(rig)

@@ -3,14 +3,15 @@
 
 mod common;
 
-use cantap_sim::bus::{BitTime, Disturbance, Node};
+use cantap_emu::bus::{BitTime, Disturbance, Node};
+use cantap_emu::machine::Setup;
+use cantap_emu::soc::CAN_IRQS;
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, Script, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::capture::{Heard, Session};
-use cantap_sim::machine::Setup;
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::soc::CAN_IRQS;
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, Script, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::record::BusErrorKind;
 use cantap_wire::{Channel, Event, Frame, Record};
@@ -27,8 +28,8 @@ fn listening() -> Option<Rig> {
 
 /// The same under a bound of time.
 fn listening_under(bound: Bound) -> Option<Rig> {
-    let setup = Setup { bound, ..Setup::default() };
-    let mut rig = Rig::new(common::firmware()?, setup, Timing::default());
+    let setup = Setup { bound, ..board::setup() };
+    let mut rig = Rig::new(common::firmware()?, setup, Timing::new(CLOCK));
     rig.connect().unwrap();
     rig.record_bytes();
     for channel in BOTH {
@@ -177,8 +178,8 @@ fn listen_only_never_drives_the_bus() {
         // Nobody else is on the second bus.
         let lonely = Traffic::new(Kind::Std8, 4, 20.0, from, from + 20 * MS);
         let other = Traffic::new(Kind::Std8, 5, 20.0, from + 30 * MS, from + 60 * MS);
-        board.wires[1].add(Node::new(BitTime::of_rate(MEGABIT)).with_source(lonely));
-        board.wires[1].add(Node::new(BitTime::of_rate(500_000)).with_source(other));
+        board.wires[1].add(Node::new(BitTime::of_rate(MEGABIT, CLOCK)).with_source(lonely));
+        board.wires[1].add(Node::new(BitTime::of_rate(500_000, CLOCK)).with_source(other));
     }
     rig.run_for(40 * MS).unwrap();
     for hold in [true, false] {
@@ -222,7 +223,7 @@ fn every_error_on_the_bus_is_reported_by_its_name() {
 #[test]
 fn a_wrong_bit_rate_shows_as_errors_and_disturbs_nobody() {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, common::setup(), Timing::default());
+    let mut rig = Rig::new(image, common::setup(), Timing::new(CLOCK));
     rig.connect().unwrap();
     for (channel, wrong) in [(Channel::Can1, 500_000), (Channel::Can2, 800_000)] {
         rig.listen(channel, wrong).unwrap();

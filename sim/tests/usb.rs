@@ -2,16 +2,17 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
+use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound;
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::Rig;
-use cantap_sim::timing::Bound;
-use cantap_sim::usb_host::Timing;
 
 #[test]
 fn the_device_enumerates_as_a_serial_port_and_says_hello() {
     for bound in Bound::ALL {
         let Some(image) = common::firmware() else { return };
-        let mut rig = Rig::new(image, Setup { bound, ..Setup::default() }, Timing::default());
+        let mut rig = Rig::new(image, Setup { bound, ..board::setup() }, Timing::new(CLOCK));
         let hello = rig.connect().unwrap();
         println!("{bound}: {hello:?} at {} us", rig.now() / 144);
         let identity = rig.with_host(|host, _| host.identity().cloned()).unwrap();

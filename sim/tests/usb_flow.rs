@@ -2,11 +2,12 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
-use cantap_sim::memory_map::OTG_FS_IRQ;
-use cantap_sim::otg::Misuse;
+use cantap_emu::machine::Setup;
+use cantap_emu::memory_map::OTG_FS_IRQ;
+use cantap_emu::otg::Misuse;
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, timing};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap_wire::{Channel, Command, Frame};
 
@@ -14,7 +15,7 @@ use cantap_wire::{Channel, Command, Frame};
 /// the end of a transfer it would cost four bytes of a packet.
 fn flood(mut next: impl FnMut(&mut fastrand::Rng) -> Command) {
     let Some(image) = common::firmware() else { return };
-    let mut rig = Rig::new(image, Setup { joined: true, ..Setup::default() }, Timing::default());
+    let mut rig = Rig::new(image, Setup { joined: true, ..board::setup() }, Timing::new(CLOCK));
     rig.connect().unwrap();
     for channel in Channel::ALL {
         let config =

@@ -3,12 +3,12 @@
 
 mod common;
 
-use cantap_sim::machine::Setup;
-use cantap_sim::otg::Misuse;
+use cantap_emu::otg::Misuse;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_emu::usb_host::control::{DEVICE_REMOTE_WAKEUP, Outcome, Request, SET_FEATURE};
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
-use cantap_sim::usb_host::control::{DEVICE_REMOTE_WAKEUP, Outcome, Request, SET_FEATURE};
 use cantap_wire::{Channel, Command};
 
 const MEGABIT: u32 = 1_000_000;
@@ -20,7 +20,7 @@ const GET_DESCRIPTOR: u8 = 6;
 
 /// A board that captures both channels.
 fn capturing() -> Option<Rig> {
-    let mut rig = Rig::new(common::firmware()?, Setup::default(), Timing::hasty());
+    let mut rig = Rig::new(common::firmware()?, board::setup(), Timing::hasty(CLOCK));
     rig.connect().unwrap();
     let from = rig.now();
     for channel in Channel::ALL {

@@ -7,10 +7,11 @@
 
 use cantap::device::{ClockMap, ClockReport, CommonClock, NotCommon, SofMark, Ticks, UtcNs};
 use cantap::wire::{Command, Event, Reply};
-use cantap_sim::machine::Setup;
+use cantap_emu::Image;
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{Rig, RigError};
-use cantap_sim::usb_host::Timing;
-use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US, Image};
+use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 
 /// UTC when the boards are switched on.
 const START_NS: i64 = 1_700_000_000_000_000_000;
@@ -58,8 +59,8 @@ struct Board {
 
 impl Board {
     fn start(image: Image, ppm: f64) -> Result<Self, RigError> {
-        let timing = Timing { board_ppm: ppm, sof_jitter: SOF_JITTER, ..Timing::hasty() };
-        let mut rig = Rig::new(image, Setup::default(), timing);
+        let timing = Timing { board_ppm: ppm, sof_jitter: SOF_JITTER, ..Timing::hasty(CLOCK) };
+        let mut rig = Rig::new(image, board::setup(), timing);
         let hello = rig.connect()?;
         let map = ClockMap::new(hello.tick_hz, UtcNs(START_NS));
         let delays = ppm.to_bits() | 1;

@@ -3,21 +3,22 @@
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use crate::board::{self, CLOCK};
 use cantap_wire::{CHANNELS, Frame};
 
 use super::exported::Exported;
 use super::server::Error;
 use super::urbs::Urbs;
-use crate::bus::{BitTime, Member, Node, Source};
-use crate::elf::Image;
-use crate::machine::{Machine, Setup};
-use crate::memory_map as map;
-use crate::otg::Otg;
 use crate::rig::MS;
 use crate::run::DEFAULT_BITRATE_BPS;
-use crate::traffic::{Kind, Traffic};
-use crate::usb::UsbPort;
-use crate::usb_host::{Counters, Outcome, Request, Timing, UsbHost};
+use cantap_emu::bus::{BitTime, Member, Node, Source};
+use cantap_emu::elf::Image;
+use cantap_emu::machine::Machine;
+use cantap_emu::memory_map as map;
+use cantap_emu::otg::Otg;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb::UsbPort;
+use cantap_emu::usb_host::{Counters, Outcome, Request, Timing, UsbHost};
 
 /// Milliseconds that a device may take from the cable to the end of its first reset, or for the server's first look.
 const PATIENCE_MS: u32 = 3000;
@@ -90,13 +91,13 @@ pub struct Board {
 impl Board {
     /// A board with `image`, and the cable out.
     pub fn new(image: Image) -> Self {
-        let mut machine = Machine::new(image, Setup::default());
-        let timing = Timing { recovery: Timing::default().recovery, ..Timing::hasty() };
+        let mut machine = Machine::new(image, board::setup());
+        let timing = Timing { recovery: Timing::new(CLOCK).recovery, ..Timing::hasty(CLOCK) };
         let port = Arc::new(Mutex::new(UsbPort::with_driver(timing, Urbs::new())));
         machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::clone(&port) as _);
         for wire in &mut machine.board().wires {
-            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS)));
-            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS)));
+            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK)));
+            wire.add(Node::new(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK)));
         }
         let nothing = Figures {
             at: Instant::now(),
@@ -186,7 +187,7 @@ impl Board {
             let Load { percent, kind, bitrate_bps } = self.load;
             let time = match (bitrate_bps, bit) {
                 (None, Some(cycles)) => BitTime::of_cycles(cycles),
-                (rate, _) => BitTime::of_rate(rate.unwrap_or(DEFAULT_BITRATE_BPS)),
+                (rate, _) => BitTime::of_rate(rate.unwrap_or(DEFAULT_BITRATE_BPS), CLOCK),
             };
             let traffic = bit.map(|_| Traffic::new(kind, self.seed + n as u64, percent, now, u64::MAX));
             let source = traffic.map(|traffic| Box::new(traffic) as Box<dyn Source>);
@@ -205,7 +206,7 @@ impl Board {
     pub fn play(&mut self, n: usize, load: Load, count: u64) {
         self.seed += SEEDS;
         let traffic = Traffic::new(load.kind, self.seed, load.percent, self.machine.now(), u64::MAX);
-        let time = self.open[n].map_or(BitTime::of_rate(DEFAULT_BITRATE_BPS), BitTime::of_cycles);
+        let time = self.open[n].map_or(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK), BitTime::of_cycles);
         let source = Box::new(First(traffic, count));
         self.machine.board().wires[n].node(TRAFFIC).restart(time, Some(source));
     }

@@ -9,8 +9,8 @@ use serde_json::json;
 
 use super::board::{Board, Load};
 use crate::CYCLES_PER_SECOND;
-use crate::traffic::Kind;
-use crate::usb_host::Request;
+use cantap_emu::traffic::Kind;
+use cantap_emu::usb_host::Request;
 
 const SET_ENDPOINT_FEATURE: (u8, u8) = (0x02, 3);
 const ENDPOINT_HALT: u16 = 0;
@@ -73,7 +73,7 @@ pub fn obey(line: &str, board: &mut Board, folder: &Path) -> Result<Wish, String
             board.with_urbs(|urbs| urbs.ask(Request::new(kind, request, ENDPOINT_HALT, address, 0)));
         }
         ["suspend"] => board.with_host(|host, _| host.suspend()),
-        ["resume"] => board.with_host(crate::usb_host::UsbHost::resume),
+        ["resume"] => board.with_host(cantap_emu::usb_host::UsbHost::resume),
         ["redirect"] => return Ok(Wish::Redirect),
         ["unplug"] => return Ok(Wish::Unplug),
         // What each controller took and sent, as FOLDER/NAME.taken1 and so on.

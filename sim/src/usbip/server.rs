@@ -14,9 +14,9 @@ use super::protocol::{self, Message, Opening};
 use super::redir::{Action, Packet, Redir};
 use super::script::{self, Wish};
 use super::urbs::{Urb, Urbs};
-use crate::elf::Image;
-use crate::stop::Stopped;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
+use cantap_emu::elf::Image;
+use cantap_emu::stop::Stopped;
 
 /// So long the machine runs before the sockets are looked at.
 const SLICE: u64 = 100 * CYCLES_PER_US;

@@ -8,8 +8,8 @@
 use std::collections::VecDeque;
 
 use super::exported::Endpoint;
-use crate::otg::{InReply, OutReply};
-use crate::usb_host::{Counters, HostDriver, Outcome, Request, Step, Token, Transfer};
+use cantap_emu::otg::{InReply, OutReply};
+use cantap_emu::usb_host::{Counters, HostDriver, Outcome, Request, Step, Token, Transfer};
 
 // Linux' error numbers, which USB/IP carries.
 /// The endpoint is halted, or the request was refused.

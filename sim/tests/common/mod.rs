@@ -3,15 +3,17 @@
 
 use std::path::{Path, PathBuf};
 
-use cantap_sim::elf::Image;
-use cantap_sim::machine::Setup;
-use cantap_sim::timing::Bound;
+use cantap_emu::elf::Image;
+use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound;
+use cantap_sim::board;
+use cantap_sim::firmware;
 
 /// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it. Without either, says
 /// so loudly and returns nothing, and the test has shown nothing.
 pub fn firmware() -> Option<Image> {
     let path = elf()?;
-    Some(Image::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+    Some(firmware::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }
 
 /// A board's name, its crystal's frequency in Hz, and where each channel's TX is: port (0 is A) and pin.
@@ -31,7 +33,7 @@ pub fn board(name: &str) -> Option<Image> {
         eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware --all` first", path.display());
         return None;
     }
-    Some(Image::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+    Some(firmware::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
 }
 
 /// The ELF's path.
@@ -57,5 +59,5 @@ pub fn bound() -> Bound {
 
 /// The default board under [`bound`].
 pub fn setup() -> Setup {
-    Setup { bound: bound(), ..Setup::default() }
+    Setup { bound: bound(), ..board::setup() }
 }

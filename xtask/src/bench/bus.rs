@@ -2,14 +2,15 @@
 //! (`docs/emulator.md`): replies, periods, times, load. Each cell has the best, then the worst.
 
 use anyhow::{Context, Result};
-use cantap_sim::Image;
+use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::drive::{self, Range};
-use cantap_sim::machine::Setup;
+use cantap_sim::firmware;
 use cantap_sim::rig::{MS, Rig};
 use cantap_sim::stream::{self, Filled, Replayed};
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
 use cantap_wire::Channel;
 use cantap_wire::Channel::{Can1, Can2};
 
@@ -121,8 +122,8 @@ fn greatest<T>(measured: Option<&[T]>, figure: impl Fn(&T) -> f64, text: impl Fn
 fn rig(other: Other, bound: Bound) -> Result<Rig> {
     let elf = Board::ALL[0].elf();
     let image =
-        Image::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
-    let mut rig = Rig::new(image, Setup { bound, ..Setup::default() }, Timing::default());
+        firmware::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
+    let mut rig = Rig::new(image, Setup { bound, ..board::setup() }, Timing::new(CLOCK));
     rig.connect()?;
     stream::join(&mut rig, other.channels())?;
     if other == Other::Full {

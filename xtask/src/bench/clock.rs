@@ -2,7 +2,7 @@
 
 use anyhow::{Context, Result};
 use cantap::device::ClockReport;
-use cantap_sim::Image;
+use cantap_sim::firmware;
 
 use crate::board::Board;
 
@@ -22,7 +22,7 @@ const SETTLED_S: [u32; 2] = [5, 60];
 pub fn run() -> Result<()> {
     let elf = Board::ALL[0].elf();
     let image =
-        Image::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
+        firmware::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
     let [fast, slow] = PPM;
     println!(
         "clock: two boards of {fast:+} and {slow:+} ppm on one emulated computer, whose clock is 25 ppm off its USB frames; {SECONDS} s"

@@ -4,14 +4,15 @@
 use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
-use cantap_sim::machine::Setup;
-use cantap_sim::profile::Table;
+use cantap_emu::machine::Setup;
+use cantap_emu::profile::Table;
+use cantap_emu::timing::Bound;
+use cantap_emu::traffic::{Kind, Traffic};
+use cantap_emu::usb_host::Timing;
+use cantap_sim::board::{self, CAPTURE_IRQS, CLOCK};
+use cantap_sim::firmware;
 use cantap_sim::rig::{MS, Rig};
-use cantap_sim::soc::CAPTURE_IRQS;
-use cantap_sim::timing::Bound;
-use cantap_sim::traffic::{Kind, Traffic};
-use cantap_sim::usb_host::Timing;
-use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US, Image};
+use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::Channel;
 
 use super::Extent;
@@ -69,8 +70,8 @@ pub fn run(extent: &Extent) -> Result<()> {
 fn loaded(kind: Kind, channels: &[Channel], ms: u64, bound: Bound) -> Result<Rig> {
     let elf = Board::ALL[0].elf();
     let image =
-        Image::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
-    let mut rig = Rig::new(image, Setup { bound, ..Setup::default() }, Timing::default());
+        firmware::open(&elf).with_context(|| format!("{}; run `cargo xtask firmware`", elf.display()))?;
+    let mut rig = Rig::new(image, Setup { bound, ..board::setup() }, Timing::new(CLOCK));
     rig.connect()?;
     for &channel in channels {
         rig.listen(channel, BITRATE_BPS)?;

@@ -1,0 +1,273 @@
+//! The start of a frame: who sends, who wins, who takes part, and from that everything that is going to
+//! happen until the bus is free again.
+
+use cantap_can::BusErrorKind;
+use cantap_can::Frame;
+
+use super::bits::FrameBits;
+use super::outcome::{self, Outcome, Participant};
+use super::{BitTime, Disturbance, Flight, Member, SYNC_BITS, Step, Wire, sampling};
+use crate::can::{CanPair, Mode};
+
+/// Those who start a frame at the same moment.
+struct Contest {
+    /// Who wins arbitration.
+    sender: Member,
+    frame: Frame,
+    bits: FrameBits,
+    bit: BitTime,
+    /// Members that send the very same frame.
+    twins: Vec<Member>,
+    /// Members that lose arbitration, each at which bit.
+    losers: Vec<(Member, usize)>,
+    /// Members with the same identifier and other contents, and the first bit that differs.
+    collided: Vec<(Member, usize)>,
+}
+
+impl Contest {
+    fn collides(&self, member: Member) -> bool {
+        self.collided.iter().any(|(other, _)| *other == member)
+    }
+
+    fn sends(&self, member: Member) -> bool {
+        self.sender == member
+            || self.twins.contains(&member)
+            || self.collides(member)
+            || self.losers.iter().any(|(other, _)| *other == member)
+    }
+}
+
+impl Wire {
+    /// Starts a frame now.
+    pub(super) fn start_frame(&mut self, can: &mut CanPair) {
+        let start = self.now;
+        let Some(contest) = self.contest(can) else { return };
+        let Contest { sender, frame, ref bits, bit, ref twins, .. } = contest;
+        self.count_recovery(can, start);
+        for n in self.attached.clone() {
+            let own = Member::Controller(n);
+            can.controllers[n].start_of_frame(contest.sends(own), start);
+        }
+
+        // Everybody who listens takes part: the sender, its twins, those who collide with it, receivers.
+        let mut members = vec![sender];
+        members.extend(twins);
+        let senders = members.len();
+        members.extend(contest.collided.iter().map(|(member, _)| *member));
+        let receivers: Vec<Member> = self
+            .members()
+            .filter(|member| !members.contains(member))
+            .filter(|member| listens(*member, can) && self.understands(*member, bit))
+            .collect();
+        members.extend(&receivers);
+        let participants: Vec<Participant> = members
+            .iter()
+            .enumerate()
+            .map(|(position, member)| {
+                let collision = contest.collided.iter().find(|(other, _)| other == member);
+                let own = match collision {
+                    Some((_, at)) => Some((*at, BusErrorKind::BitRecessive)),
+                    None if position < senders => None,
+                    None => self.misheard(*member, bits, bit, can),
+                };
+                let (acknowledges, flags) = self.abilities(*member, can);
+                Participant { sender: position < senders, acknowledges, flags, own }
+            })
+            .collect();
+        let disturbance = self.take_disturbance();
+        let outcome = Outcome::of(bits, &participants, disturbance);
+        count_dominant(&contest, &members, &participants, &outcome, can);
+
+        let at = |bits: usize| start + bit.cycles(bits as u64);
+        let mut steps: Vec<(u64, Step)> = contest
+            .losers
+            .iter()
+            .map(|(member, bit)| (at(bit + 1), Step::LoseArbitration(*member)))
+            .collect();
+        for detection in &outcome.detections {
+            let member = members[detection.who];
+            let sends = detection.who < senders || contest.collides(member);
+            steps.push((at(detection.bit + 1), Step::Error(member, sends, *detection)));
+        }
+        let error = outcome.of_participant(0).map(|detection| detection.kind);
+        let good = |who: usize| outcome.of_participant(who).is_none();
+        let takers: Vec<usize> = (0..members.len())
+            .filter(|who| !participants[*who].sender && good(*who))
+            .filter_map(|who| match members[who] {
+                Member::Controller(n) => Some(n),
+                Member::Node(n) => {
+                    self.nodes[n].counters.received();
+                    None
+                }
+            })
+            .collect();
+        let finish = if error.is_none() { bits.len() } else { outcome.free_after };
+        steps.push((at(bits.valid_after()), Step::Receive));
+        steps.push((at(finish), Step::Finish));
+        steps.sort_by_key(|(time, _)| *time);
+        self.flight = Some(Flight {
+            sender,
+            twins: twins.clone(),
+            frame,
+            start,
+            valid: at(bits.valid_after()),
+            end: at(bits.len()),
+            free: at(outcome.free_after),
+            recessive: at(outcome.recessive_from),
+            error,
+            bit,
+            receivers: takers,
+            taken_by: 0,
+            steps: steps.into(),
+        });
+        self.started += 1;
+    }
+
+    /// Who wants to send now, and who wins; `None` if nobody does.
+    fn contest(&self, can: &CanPair) -> Option<Contest> {
+        let mut contenders: Vec<(Member, Frame, FrameBits)> = self
+            .members()
+            .filter_map(|member| {
+                let (due, frame) = self.wants(member, can)?;
+                (due <= self.now).then(|| (member, frame, FrameBits::new(&frame)))
+            })
+            .collect();
+        let bit = self.bit_of(contenders.first()?.0, can);
+        contenders.retain(|(member, ..)| self.bit_of(*member, can).agrees_with(&bit));
+        let winner = (1..contenders.len()).fold(0, |best, other| {
+            if beats(&contenders[other].2, &contenders[best].2) { other } else { best }
+        });
+        let (sender, frame, bits) = contenders.swap_remove(winner);
+        let bit = self.bit_of(sender, can);
+        let mut contest =
+            Contest { sender, frame, bits, bit, twins: Vec::new(), losers: Vec::new(), collided: Vec::new() };
+        for (member, _, own) in &contenders {
+            match first_difference(own, &contest.bits) {
+                None => contest.twins.push(*member),
+                Some(at) if at < own.arbitration_end() => contest.losers.push((*member, at)),
+                Some(at) => contest.collided.push((*member, at)),
+            }
+        }
+        Some(contest)
+    }
+
+    /// Simulated nodes of another bit rate than the frame's are left out of it: only the emulated controllers are
+    /// shown what a wrong bit rate looks like.
+    fn understands(&self, member: Member, bit: BitTime) -> bool {
+        match member {
+            Member::Controller(_) => true,
+            Member::Node(n) => self.nodes[n].bit.agrees_with(&bit),
+        }
+    }
+
+    /// Whether a member acknowledges, and whether it flags errors with dominant bits.
+    pub(super) fn abilities(&self, member: Member, can: &CanPair) -> (bool, bool) {
+        match member {
+            Member::Controller(n) => {
+                let controller = &can.controllers[n];
+                (controller.answers(), controller.answers() && !controller.counters().passive())
+            }
+            Member::Node(n) => {
+                let node = &self.nodes[n];
+                let sends = node.wanted().is_some();
+                (node.acknowledges, (node.acknowledges || sends) && !node.counters.passive())
+            }
+        }
+    }
+
+    /// The error that a receiver of another bit rate sees, and at which bit of the sender's.
+    fn misheard(
+        &self,
+        member: Member,
+        bits: &FrameBits,
+        bit: BitTime,
+        can: &CanPair,
+    ) -> Option<(usize, BusErrorKind)> {
+        let Member::Controller(n) = member else { return None };
+        if self.bit_of(member, can).agrees_with(&bit) {
+            return None;
+        }
+        let mut levels = bits.levels().to_vec();
+        levels[bits.ack_slot()] = false;
+        let timing = can.controllers[n].timing();
+        match sampling::listen(&levels, |n| bit.cycles(n as u64), &timing) {
+            sampling::Heard::Frame => None,
+            sampling::Heard::Error { after, kind } => {
+                let at = (0..bits.len()).take_while(|n| bit.cycles(*n as u64 + 1) < after).count();
+                Some((at.min(bits.len() - 2), kind))
+            }
+        }
+    }
+
+    fn take_disturbance(&mut self) -> Option<Disturbance> {
+        /// A bit of the identifier or the control field, which every frame has.
+        const NOISY_BITS: std::ops::Range<usize> = 1..19;
+        let planned = self.disturbances.pop_front_if(|(frame, _)| *frame <= self.started);
+        let (share, random) = &mut self.noise;
+        match planned {
+            Some((_, disturbance)) => Some(disturbance),
+            None if *share > 0.0 && random.f64() < *share => {
+                Some(Disturbance::Bit { index: random.usize(NOISY_BITS) })
+            }
+            None => None,
+        }
+    }
+
+    /// Sequences of eleven recessive bits since the last frame, for controllers in bus-off.
+    fn count_recovery(&self, can: &mut CanPair, start: u64) {
+        for n in &self.attached {
+            let controller = &mut can.controllers[*n];
+            if let Mode::BusOff { since, .. } = controller.mode() {
+                let from = since.max(self.recessive);
+                let sequences = start.saturating_sub(from) / (SYNC_BITS * controller.timing().bit());
+                controller.recover(sequences as u32);
+            }
+        }
+    }
+}
+
+fn first_difference(one: &FrameBits, other: &FrameBits) -> Option<usize> {
+    let length = one.len().max(other.len());
+    (0..length).find(|bit| one.levels().get(*bit) != other.levels().get(*bit))
+}
+
+/// Whether the first bit in which they differ is dominant in `one`.
+fn beats(one: &FrameBits, other: &FrameBits) -> bool {
+    first_difference(one, other).is_some_and(|bit| one.levels().get(bit) == Some(&false))
+}
+
+/// Whether a member takes part in what happens on the bus.
+fn listens(member: Member, can: &CanPair) -> bool {
+    match member {
+        Member::Controller(n) => can.controllers[n].listens(),
+        Member::Node(_) => true,
+    }
+}
+
+/// Adds what each emulated controller puts on the bus in this frame.
+fn count_dominant(
+    contest: &Contest,
+    members: &[Member],
+    participants: &[Participant],
+    outcome: &Outcome,
+    can: &mut CanPair,
+) {
+    for (who, member) in members.iter().enumerate() {
+        let Member::Controller(n) = *member else { continue };
+        let detection = outcome.of_participant(who);
+        let sends = participants[who].sender || contest.collides(*member);
+        let mut driven = 0;
+        if sends {
+            driven +=
+                contest.bits.dominant_in(detection.map_or(contest.bits.len(), |detection| detection.bit + 1));
+        }
+        driven += u64::from(outcome.acknowledged_by.contains(&who));
+        driven += if detection.is_some() && participants[who].flags { outcome::FLAG as u64 } else { 0 };
+        can.controllers[n].drove(driven);
+    }
+    for (member, lost_at) in &contest.losers {
+        if let Member::Controller(n) = *member {
+            can.controllers[n].drove(contest.bits.dominant_in(*lost_at));
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! A receive FIFO: three mailboxes, and what happens with the fourth frame (RM0090 Rev 21 §32.7.3).
+
+use std::collections::VecDeque;
+
+use cantap_can::Frame;
+
+use super::identifier_word;
+
+/// Mailboxes of a FIFO.
+pub const DEPTH: usize = 3;
+
+const FULL: u32 = 1 << 3;
+const OVERRUN: u32 = 1 << 4;
+const RELEASE: u32 = 1 << 5;
+
+/// A received frame in its mailbox.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Entry {
+    frame: Frame,
+    filter: u8,
+}
+
+/// Receive FIFO 0 or 1.
+#[derive(Clone, Debug, Default)]
+pub struct Fifo {
+    entries: VecDeque<Entry>,
+    full: bool,
+    overrun: bool,
+    lost: u64,
+}
+
+impl Fifo {
+    /// A frame passed the filters. With `locked` (RFLM) a full FIFO drops it, without it replaces the
+    /// newest. Returns whether a frame was lost.
+    pub fn put(&mut self, frame: Frame, filter: u8, locked: bool) -> bool {
+        let entry = Entry { frame, filter };
+        let lost = self.entries.len() == DEPTH;
+        if lost {
+            self.overrun = true;
+            self.lost += 1;
+            if !locked {
+                self.entries[DEPTH - 1] = entry;
+            }
+        } else {
+            self.entries.push_back(entry);
+        }
+        // Set when the third frame is stored, cleared by software only.
+        self.full |= self.entries.len() == DEPTH;
+        lost
+    }
+
+    /// Frames waiting: 0 to 3.
+    pub fn fill(&self) -> usize {
+        self.entries.len()
+    }
+
+    /// Frames lost to overruns so far.
+    pub fn lost(&self) -> u64 {
+        self.lost
+    }
+
+    /// RFxR.
+    pub fn status(&self) -> u32 {
+        self.entries.len() as u32 | if self.full { FULL } else { 0 } | if self.overrun { OVERRUN } else { 0 }
+    }
+
+    /// A write to RFxR: releases the oldest frame, clears flags.
+    pub fn control(&mut self, value: u32) {
+        if value & FULL != 0 {
+            self.full = false;
+        }
+        if value & OVERRUN != 0 {
+            self.overrun = false;
+        }
+        if value & RELEASE != 0 {
+            self.entries.pop_front();
+        }
+    }
+
+    /// RIxR, RDTxR, RDLxR or RDHxR (0 to 3) of the oldest frame; zero if there is none. There is no time
+    /// stamp: the time-triggered mode is not to be used on these chips.
+    pub fn mailbox(&self, register: u32) -> u32 {
+        let Some(Entry { frame, filter }) = self.entries.front() else { return 0 };
+        let data = frame.padded_data();
+        let word = |at: usize| u32::from_le_bytes([data[at], data[at + 1], data[at + 2], data[at + 3]]);
+        match register {
+            0 => identifier_word(frame),
+            1 => u32::from(*filter) << 8 | u32::from(frame.dlc()),
+            2 => word(0),
+            _ => word(4),
+        }
+    }
+
+    /// Whether the interrupt is asserted, given IER's message-pending, full and overrun enables.
+    pub fn irq(&self, pending: bool, full: bool, overrun: bool) -> bool {
+        pending && !self.entries.is_empty() || full && self.full || overrun && self.overrun
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fill(locked: bool) -> Fifo {
+        let mut fifo = Fifo::default();
+        for id in 1..=5u32 {
+            let frame = format!("{id:03X}#").parse().unwrap();
+            assert_eq!(fifo.put(frame, 0, locked), id > 3);
+        }
+        fifo
+    }
+
+    fn drain(fifo: &mut Fifo) -> Vec<u32> {
+        let mut ids = Vec::new();
+        while fifo.fill() > 0 {
+            ids.push(fifo.mailbox(0) >> 21);
+            fifo.control(RELEASE);
+        }
+        ids
+    }
+
+    #[test]
+    fn an_overrun_keeps_the_newest_frame_unless_locked() {
+        let mut fifo = fill(false);
+        assert_eq!(fifo.status(), 3 | FULL | OVERRUN);
+        assert_eq!(fifo.lost(), 2);
+        assert_eq!(drain(&mut fifo), [1, 2, 5]);
+        let mut fifo = fill(true);
+        assert_eq!(drain(&mut fifo), [1, 2, 3]);
+    }
+
+    #[test]
+    fn full_and_overrun_stay_until_cleared() {
+        let mut fifo = fill(true);
+        drain(&mut fifo);
+        assert_eq!(fifo.status(), FULL | OVERRUN);
+        assert!(
+            fifo.irq(false, true, false) && fifo.irq(false, false, true) && !fifo.irq(true, false, false)
+        );
+        fifo.control(OVERRUN);
+        assert_eq!(fifo.status(), FULL);
+        fifo.control(FULL);
+        assert_eq!(fifo.status(), 0);
+    }
+}

@@ -1,0 +1,32 @@
+//! An STM32F405 or F407 that runs an unmodified program instruction by instruction, with two CAN buses and a USB host attached.
+//!
+//! It knows nothing of what the program is for. What it must be told is in [`Setup`]: the core's clock, the board's crystal, which
+//! interrupts' masking is to be measured. Time is core cycles everywhere ([`Clock`]); nothing here looks at the host's clock, so the
+//! same inputs give the same run, byte for byte. How long the core waits for its memories is one of two bounds ([`timing`]).
+
+#![forbid(unsafe_code)]
+
+pub mod bus;
+pub mod can;
+mod clock;
+pub mod cpu;
+pub mod elf;
+pub mod machine;
+pub mod memory_map;
+pub mod otg;
+pub mod peripheral;
+pub mod probe;
+pub mod profile;
+pub mod soc;
+pub mod stop;
+pub mod timing;
+pub mod trace;
+pub mod traffic;
+pub mod usb;
+pub mod usb_host;
+
+pub use clock::Clock;
+pub use elf::{ElfError, Image};
+pub use machine::{Machine, Setup};
+pub use peripheral::Peripheral;
+pub use stop::{Reason, Stopped};

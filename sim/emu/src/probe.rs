@@ -1,0 +1,186 @@
+//! What a run costs: cycles per exception and asleep, the longest time in which interrupts were
+//! masked, how full the receive FIFOs became. What a cycle count means depends on the bound (see
+//! [`crate::timing`]).
+
+use crate::cpu::State;
+
+/// Exception numbers that are counted: 16 of the core and the chip's interrupts.
+pub const EXCEPTIONS: usize = 128;
+
+/// A time in which the watched interrupts ([`crate::Setup::watched`]) were masked.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct MaskedWindow {
+    /// When it began, in core cycles.
+    pub start: u64,
+    /// How long it lasted, in core cycles.
+    pub cycles: u64,
+    /// Where it ended.
+    pub pc: u32,
+    /// Whether one of them was waiting at its end.
+    pub waited: bool,
+}
+
+/// A change of what the core does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Change {
+    /// An exception was entered, perhaps within another.
+    Enter(u16),
+    /// An exception ended, and with it what it may have interrupted goes on.
+    Leave(u16),
+    /// One exception ended and the next began at once.
+    Chain(u16, u16),
+}
+
+/// Counters over a run, or since [`Probe::reset`].
+#[derive(Clone, Debug)]
+pub struct Probe {
+    cycles: [u64; EXCEPTIONS],
+    entries: [u64; EXCEPTIONS],
+    asleep: u64,
+    stalled: u64,
+    since: u64,
+    open_window: Option<u64>,
+    longest: MaskedWindow,
+    longest_with_one_waiting: MaskedWindow,
+    fifo_max: [usize; 2],
+    active: Vec<u16>,
+}
+
+impl Default for Probe {
+    fn default() -> Self {
+        Self {
+            cycles: [0; EXCEPTIONS],
+            entries: [0; EXCEPTIONS],
+            asleep: 0,
+            stalled: 0,
+            since: 0,
+            open_window: None,
+            longest: MaskedWindow::default(),
+            longest_with_one_waiting: MaskedWindow::default(),
+            fifo_max: [0; 2],
+            active: Vec::new(),
+        }
+    }
+}
+
+impl Probe {
+    /// Counts from `now` on. A masked window under way does not count: start-up, for example, is masked
+    /// from end to end.
+    pub fn reset(&mut self, now: u64) {
+        let active = std::mem::take(&mut self.active);
+        *self = Self { since: now, active, ..Self::default() };
+    }
+
+    /// When counting began.
+    pub fn since(&self) -> u64 {
+        self.since
+    }
+
+    /// Core cycles spent in exception `number` itself, without what interrupted it; 0 is thread mode.
+    pub fn cycles(&self, number: u16) -> u64 {
+        self.cycles[usize::from(number)]
+    }
+
+    /// How often exception `number` was entered.
+    pub fn entries(&self, number: u16) -> u64 {
+        self.entries[usize::from(number)]
+    }
+
+    /// Core cycles asleep.
+    pub fn asleep(&self) -> u64 {
+        self.asleep
+    }
+
+    /// Core cycles in which the core stood still because flash was being written.
+    pub fn stalled(&self) -> u64 {
+        self.stalled
+    }
+
+    /// The longest time in which the watched interrupts were masked.
+    pub fn longest_masked(&self) -> MaskedWindow {
+        self.longest
+    }
+
+    /// The longest one of those at whose end one was waiting.
+    pub fn longest_masked_with_one_waiting(&self) -> MaskedWindow {
+        self.longest_with_one_waiting
+    }
+
+    /// The most frames that waited in a receive FIFO of controller 0 or 1.
+    pub fn fifo_max(&self, controller: usize) -> usize {
+        self.fifo_max[controller]
+    }
+
+    /// The share of time that the core was awake, in per cent, until `now`.
+    pub fn load_percent(&self, now: u64) -> f64 {
+        let span = (now - self.since).max(1);
+        100.0 - 100.0 * self.asleep as f64 / span as f64
+    }
+
+    pub(crate) fn slept(&mut self, cycles: u64) {
+        self.asleep += cycles;
+    }
+
+    pub(crate) fn stood_still(&mut self, cycles: u64) {
+        self.stalled += cycles;
+    }
+
+    pub(crate) fn fifo(&mut self, controller: usize, fill: usize) {
+        self.fifo_max[controller] = self.fifo_max[controller].max(fill);
+    }
+
+    /// Accounts one step from `before` to `after`.
+    pub(crate) fn step(&mut self, before: &State, after: &State, cycles: u64) -> Option<Change> {
+        let (from, to) = (before.exception(), after.exception());
+        if from == to {
+            self.cycles[usize::from(from) % EXCEPTIONS] += cycles;
+            return None;
+        }
+        // Only an entry pushes a frame; a return or a chained entry takes one off or leaves it.
+        let entered = after.sp.wrapping_add(0x20) <= before.sp;
+        let owner = if entered { to } else { from };
+        self.cycles[usize::from(owner) % EXCEPTIONS] += cycles;
+        if entered {
+            self.enter(to);
+            return Some(Change::Enter(to));
+        }
+        self.active.pop();
+        if self.active.last().copied().unwrap_or(0) == to {
+            return Some(Change::Leave(from));
+        }
+        self.enter(to);
+        Some(Change::Chain(from, to))
+    }
+
+    fn enter(&mut self, exception: u16) {
+        self.entries[usize::from(exception) % EXCEPTIONS] += 1;
+        self.active.push(exception);
+    }
+
+    /// Follows the masks; returns a window that has just ended.
+    pub(crate) fn masked(&mut self, masked: bool, waits: bool, now: u64, pc: u32) -> Option<MaskedWindow> {
+        match (self.open_window, masked) {
+            (None, true) => {
+                self.open_window = Some(now);
+                None
+            }
+            (Some(start), false) => {
+                self.open_window = None;
+                let window = MaskedWindow { start, cycles: now - start, pc, waited: waits };
+                if window.cycles > self.longest.cycles {
+                    self.longest = window;
+                }
+                if waits && window.cycles > self.longest_with_one_waiting.cycles {
+                    self.longest_with_one_waiting = window;
+                }
+                Some(window)
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether a masked window is open.
+    pub(crate) fn in_window(&self) -> bool {
+        self.open_window.is_some()
+    }
+}

@@ -1,0 +1,603 @@
+//! The chip around the core: address decode, clock gating, interrupt lines, and the two CAN buses that
+//! hang on it. An access to a register that no model knows is noted, never silently swallowed.
+
+pub mod flash;
+pub mod rcc;
+pub mod rom;
+pub mod small;
+pub mod timer;
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::ops::Range;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use crate::bus::Wire;
+use crate::can::CanPair;
+use crate::cpu::{Bus, Memories};
+use crate::memory_map as map;
+use crate::timing::Speeds;
+use crate::{Clock, Peripheral};
+use flash::FlashInterface;
+use rcc::{Crystal, Rcc, ResetCause};
+use small::{Adc, Crc, Gpio, Storage, Watchdog};
+use timer::Timer;
+
+/// GPIO ports A to I.
+const PORTS: usize = 9;
+/// TIM2 to TIM7: bits of the counter and interrupt number (RM0090 Rev 21 Table 61).
+const TIMERS: [(u32, u16); 6] = [(32, 28), (16, 29), (16, 30), (32, 50), (16, 54), (16, 55)];
+/// Interrupt numbers of CAN1 and CAN2: transmit, FIFO 0, FIFO 1, status change and error.
+pub const CAN_IRQS: [[u16; 4]; 2] = [[19, 20, 21, 22], [63, 64, 65, 66]];
+
+/// The one trigger output that is wired: OTG_FS's start of frame, as TIM2_OR.ITR1_RMP has it (RM0090, TIM2_OR).
+const OTG_FS_SOF: u32 = 2;
+const CAN1_BASE: u32 = 0x4000_6400;
+const GPIO_BASE: u32 = 0x4002_0000;
+/// A peripheral's registers are in a block of this size, or a multiple.
+const BLOCK: u32 = 0x400;
+
+/// For so many cycles of the slower bus a peripheral cannot be reached after its clock was switched on: one for the store to
+/// arrive, and what ES0182 gives for APB, one and the bus's divider.
+const CLOCK_ENABLE_CYCLES: u64 = 4;
+
+/// What is odd about an access.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Oddity {
+    /// No model knows the register.
+    Unknown,
+    /// The peripheral's clock is off: reads are 0, writes are lost.
+    Unclocked,
+    /// The hardware would not take the write in its present state.
+    Refused,
+    /// It leaves flash fewer wait states than the core's clock wants.
+    TooFast,
+}
+
+/// An odd access, as often as it happened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct OddAccess {
+    /// What is odd.
+    pub oddity: Oddity,
+    /// The register's address.
+    pub address: u32,
+    /// A write, rather than a read.
+    pub write: bool,
+    /// How often.
+    pub count: u64,
+}
+
+impl fmt::Display for OddAccess {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let kind = if self.write { "write" } else { "read" };
+        let reason = match self.oddity {
+            Oddity::Unknown => "no model knows it",
+            Oddity::Unclocked => "its peripheral's clock is off",
+            Oddity::Refused => "the hardware does not take it now",
+            Oddity::TooFast => "flash has too few wait states for the clock",
+        };
+        write!(f, "{kind} of {:#010x}, {} times: {reason}", self.address, self.count)
+    }
+}
+
+struct Device {
+    range: Range<u32>,
+    irq: u16,
+    model: Arc<Mutex<dyn Peripheral + Send>>,
+}
+
+impl Device {
+    /// A peer that panicked while it held the lock leaves a state that is as good as any other.
+    fn lock(&self) -> MutexGuard<'_, dyn Peripheral + Send + 'static> {
+        self.model.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Everything on the chip but core and memories, and what is wired to it.
+pub struct Board {
+    /// Reset and clock control.
+    pub rcc: Rcc,
+    /// The CAN controllers.
+    pub can: CanPair,
+    /// The CAN buses: with two, each controller has its own; joined, both are on the first.
+    pub wires: [Wire; 2],
+    ports: Vec<Gpio>,
+    flash: FlashInterface,
+    timers: [Timer; 6],
+    watchdog: Watchdog,
+    adc: Adc,
+    power: Storage,
+    syscfg: Storage,
+    exti: Storage,
+    crc: Crc,
+    dbgmcu: Storage,
+    devices: Vec<Device>,
+    /// Interrupt of the attached device that was last reached, until somebody asks.
+    reached: Option<u16>,
+    odd: BTreeMap<(Oddity, u32, bool), u64>,
+    clock: Clock,
+    crystal: Crystal,
+    /// What the boot pins tell SYSCFG_MEMRMP after a reset of SYSCFG.
+    boot_mode: u32,
+    /// A peripheral whose clock was just switched on, and is not there yet.
+    awaited: Option<Awaited>,
+}
+
+/// A clock that was just switched on (ES0182, "Delay after an RCC peripheral clock enabling").
+#[derive(Clone, Copy, Debug)]
+struct Awaited {
+    /// The enable register's offset, and the bits that were set.
+    register: u32,
+    bits: u32,
+    /// When the peripherals can be reached, if nobody waits for it properly before: by a barrier, or by reading back.
+    until: u64,
+}
+
+impl Board {
+    /// A chip after power-on, with the board's crystal.
+    pub fn new(memories: &Memories, clock: Clock, crystal: Crystal) -> Self {
+        Self {
+            rcc: Rcc::new(clock, crystal, ResetCause::PowerOn),
+            can: CanPair::default(),
+            wires: [Wire::new(&[0]), Wire::new(&[1])],
+            ports: (0..PORTS).map(Gpio::new).collect(),
+            flash: FlashInterface::new(clock, memories.flash.clone()),
+            timers: TIMERS.map(|(bits, _)| Timer::new(bits)),
+            watchdog: Watchdog::new(clock),
+            adc: Adc::default(),
+            power: power(),
+            syscfg: syscfg(rom::FLASH),
+            exti: Storage::new(6, &[]),
+            crc: Crc::default(),
+            dbgmcu: dbgmcu(),
+            devices: Vec::new(),
+            reached: None,
+            odd: BTreeMap::new(),
+            clock,
+            crystal,
+            boot_mode: rom::FLASH,
+            awaited: None,
+        }
+    }
+
+    /// What cycles are.
+    pub fn clock(&self) -> Clock {
+        self.clock
+    }
+
+    /// Puts a device at a range of addresses, with an interrupt line.
+    pub fn attach(&mut self, range: Range<u32>, irq: u16, model: Arc<Mutex<dyn Peripheral + Send>>) {
+        self.devices.push(Device { range, irq, model });
+    }
+
+    /// A system reset: everything but memories and the buses, whose nodes go on.
+    pub fn reset(&mut self, cause: ResetCause, now: u64) {
+        self.advance(now);
+        self.rcc = Rcc::new(self.clock, self.crystal, cause);
+        self.awaited = None;
+        // The jumper for the ROM bootloader, if there was one, is out.
+        self.boot_mode = rom::FLASH;
+        self.ports = (0..PORTS).map(Gpio::new).collect();
+        self.flash = self.flash.after_reset();
+        for timer in &mut self.timers {
+            *timer = timer.after_reset();
+        }
+        self.watchdog = Watchdog::new(self.clock);
+        self.adc = Adc::default();
+        self.power = power();
+        self.syscfg = syscfg(self.boot_mode);
+        self.exti = Storage::new(6, &[]);
+        self.crc = Crc::default();
+        for controller in 0..2 {
+            self.can.reset(controller);
+        }
+        for device in &self.devices {
+            device.lock().reset(now);
+        }
+        self.follow_clocks(now);
+    }
+
+    /// The level of pin `pin` of port `port` (0 for A) if it is an output. For LEDs.
+    pub fn output_pin(&self, port: usize, pin: u32) -> Option<bool> {
+        self.ports.get(port)?.output(pin)
+    }
+
+    /// A GPIO port's registers as they read: port 0 is A. For how pins are set up.
+    pub fn port(&self, port: usize) -> Option<&Gpio> {
+        self.ports.get(port)
+    }
+
+    /// What is at address 0, by SYSCFG_MEMRMP: flash unless [`rom::SYSTEM_MEMORY`].
+    pub fn memory_at_zero(&self) -> u32 {
+        self.syscfg.read(0).unwrap_or(0) & 3
+    }
+
+    /// The debug component's control register.
+    pub fn debug_control(&self) -> u32 {
+        self.dbgmcu.read(4).unwrap_or(0)
+    }
+
+    /// Whether a peripheral's clock was just switched on, so that it matters whether the core executes a barrier.
+    pub fn awaits_clock(&self) -> bool {
+        self.awaited.is_some()
+    }
+
+    /// The core executed a barrier: what it wrote has arrived.
+    pub fn barrier(&mut self) {
+        self.awaited = None;
+    }
+
+    /// Leaves an error in the flash interface that nobody has cleared.
+    pub fn leave_flash_error(&mut self) {
+        self.flash.leave_error(flash::PGSERR);
+    }
+
+    /// The interrupt of the attached device that the core has reached since this was last asked.
+    pub fn take_reached(&mut self) -> Option<u16> {
+        self.reached.take()
+    }
+
+    /// When the watchdog resets the chip, if it runs.
+    pub fn watchdog_deadline(&self) -> Option<u64> {
+        self.watchdog.deadline()
+    }
+
+    /// The core cycle at which TIM2 stood at zero, if it has counted without being written or stopped since.
+    pub fn tim2_origin(&mut self, now: u64) -> u64 {
+        self.timers[0].origin(now)
+    }
+
+    /// Every access that was odd, with how often.
+    pub fn odd_accesses(&self) -> Vec<OddAccess> {
+        let access = |(key, count): (&(Oddity, u32, bool), &u64)| OddAccess {
+            oddity: key.0,
+            address: key.1,
+            write: key.2,
+            count: *count,
+        };
+        self.odd.iter().map(access).collect()
+    }
+
+    /// Holds both buses dominant, or lets go of them.
+    pub fn hold_buses_dominant(&mut self, hold: bool) {
+        for wire in &mut self.wires {
+            wire.hold_dominant(hold, &mut self.can);
+        }
+    }
+
+    /// What the program has set up that the core's times depend on.
+    pub fn speeds(&self) -> Speeds {
+        let clocks = self.rcc.clocks();
+        let access = self.flash.access();
+        Speeds {
+            wait_states: access.wait_states,
+            prefetch: access.prefetch,
+            instruction_cache: access.instruction_cache,
+            data_cache: access.data_cache,
+            apb1: clocks.hclk_hz / clocks.pclk1_hz.max(1),
+            apb2: clocks.hclk_hz / clocks.pclk2_hz.max(1),
+        }
+    }
+
+    /// Core cycles for which the core must stand still now.
+    pub fn take_stall(&mut self) -> u64 {
+        self.flash.take_stall()
+    }
+
+    /// The levels of the interrupt lines; bit n is interrupt n.
+    pub fn lines(&self) -> u128 {
+        let mut lines = 0u128;
+        let mut set = |irq: u16, level: bool| lines |= u128::from(level) << irq;
+        for (n, irqs) in CAN_IRQS.iter().enumerate() {
+            for (irq, level) in irqs.iter().zip(self.can.irqs(n)) {
+                set(*irq, level);
+            }
+        }
+        for ((_, irq), timer) in TIMERS.iter().zip(&self.timers) {
+            set(*irq, timer.irq());
+        }
+        for device in &self.devices {
+            set(device.irq, device.lock().irq());
+        }
+        lines
+    }
+
+    /// When [`Self::advance`] is wanted next.
+    pub fn next_event(&self) -> Option<u64> {
+        let wires = self.wires.iter().filter_map(|wire| wire.next_event(&self.can));
+        let timers = self.timers.iter().filter_map(Timer::next_event);
+        let devices = self.devices.iter().filter_map(|device| device.lock().next_event());
+        wires.chain(timers).chain(devices).chain(self.can.next_event()).chain(self.watchdog.deadline()).min()
+    }
+
+    /// Lets everything happen that is due at or before `now`.
+    pub fn advance(&mut self, now: u64) {
+        self.advance_buses(now);
+        for timer in &mut self.timers {
+            timer.advance(now);
+        }
+        let mut trigger = None;
+        for device in &self.devices {
+            let mut device = device.lock();
+            if device.next_event().is_some_and(|due| due <= now) {
+                device.advance(now);
+            }
+            trigger = device.take_trigger().or(trigger);
+        }
+        self.trigger(trigger, now);
+    }
+
+    /// A device's trigger output pulsed at a cycle that is not later than `now`.
+    fn trigger(&mut self, at: Option<u64>, now: u64) {
+        if let Some(at) = at {
+            self.timers[0].remapped_trigger(OTG_FS_SOF, at, now);
+        }
+    }
+
+    fn advance_buses(&mut self, now: u64) {
+        self.can.advance(now);
+        for wire in &mut self.wires {
+            wire.advance(now, &mut self.can);
+        }
+    }
+
+    /// Passes the clock tree on to those whose time depends on it.
+    fn follow_clocks(&mut self, now: u64) {
+        let clocks = self.rcc.clocks();
+        for controller in &mut self.can.controllers {
+            controller.set_cycles_per_clock(clocks.cycles_per_pclk1);
+        }
+        for timer in &mut self.timers {
+            timer.set_cycles_per_clock(clocks.cycles_per_timer_clock, now);
+        }
+    }
+
+    /// The enable bit of the peripheral at `address`, as register offset and bit; none if it needs no
+    /// clock or is not known.
+    fn clock_gate(address: u32) -> Option<(u32, u32)> {
+        match address {
+            0x4000_0000..0x4000_1800 => Some((0x40, (address - 0x4000_0000) / BLOCK)),
+            0x4000_6400..0x4000_6800 => Some((0x40, 25)),
+            0x4000_6800..0x4000_6C00 => Some((0x40, 26)),
+            0x4000_7000..0x4000_7400 => Some((0x40, 28)),
+            0x4001_2000..0x4001_2400 => Some((0x44, 8)),
+            0x4001_3800..0x4001_3C00 => Some((0x44, 14)),
+            0x4002_0000..0x4002_2400 => Some((0x30, (address - GPIO_BASE) / BLOCK)),
+            0x4002_3000..0x4002_3400 => Some((0x30, 12)),
+            0x5000_0000..0x5004_0000 => Some((0x34, 7)),
+            _ => None,
+        }
+    }
+
+    fn clocked(&self, address: u32, now: u64) -> bool {
+        let Some((register, bit)) = Self::clock_gate(address) else { return true };
+        let comes = self.awaited.is_some_and(|awaited| {
+            awaited.register == register && awaited.bits >> bit & 1 != 0 && now < awaited.until
+        });
+        self.rcc.enabled(register, bit) && !comes
+    }
+
+    /// After a write to the clock controller: which clocks it switched on.
+    fn await_clocks(&mut self, register: u32, before: u32, now: u64) {
+        let bits = self.rcc.read(register).unwrap_or(0) & !before;
+        if Rcc::is_enable_register(register) && bits != 0 {
+            let until = now + CLOCK_ENABLE_CYCLES * self.rcc.clocks().cycles_per_pclk1;
+            self.awaited = Some(Awaited { register, bits, until });
+        }
+    }
+
+    fn note(&mut self, oddity: Oddity, address: u32, write: bool) {
+        *self.odd.entry((oddity, address, write)).or_default() += 1;
+    }
+
+    fn read(&mut self, address: u32, size: u8, now: u64) -> u32 {
+        if map::SYSTEM_MEMORY.contains(&address) {
+            return small::factory_values(address, size);
+        }
+        if !self.clocked(address, now) {
+            self.note(Oddity::Unclocked, address, false);
+            return 0;
+        }
+        if let Some(device) = self.devices.iter().find(|device| device.range.contains(&address)) {
+            self.reached = Some(device.irq);
+            let mut model = device.lock();
+            let value = model.read(address - device.range.start, size, now);
+            let trigger = model.take_trigger();
+            drop(model);
+            self.trigger(trigger, now);
+            return value;
+        }
+        let Some(word) = self.read_register(address & !3, now) else {
+            self.note(Oddity::Unknown, address & !3, false);
+            return 0;
+        };
+        let value = word >> (8 * (address & 3));
+        if size == 4 { value } else { value & ((1 << (8 * size)) - 1) }
+    }
+
+    fn read_register(&mut self, address: u32, now: u64) -> Option<u32> {
+        let offset = address % BLOCK;
+        match address - offset {
+            0x4000_0000..=0x4000_1400 => self.timers[block(address, 0x4000_0000)].read(offset, now),
+            0x4000_3000 => self.watchdog.read(offset),
+            CAN1_BASE | 0x4000_6800 => {
+                self.advance_buses(now);
+                self.can.read(address - CAN1_BASE, now)
+            }
+            0x4000_7000 => self.power.read(offset),
+            0x4001_2000 => self.adc.read(offset),
+            0x4001_3800 => self.syscfg.read(offset),
+            0x4001_3C00 => self.exti.read(offset),
+            GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].read(offset),
+            0x4002_3000 => self.crc.read(offset),
+            0x4002_3800 => {
+                self.awaited = None;
+                if self.rcc.settle(now) {
+                    self.advance(now);
+                    self.follow_clocks(now);
+                    self.check_wait_states(address & !3, false);
+                }
+                self.rcc.read(offset)
+            }
+            0x4002_3C00 => self.flash.read(offset),
+            0xE004_2000 => self.dbgmcu.read(offset),
+            _ => None,
+        }
+    }
+
+    fn write(&mut self, address: u32, size: u8, value: u32, now: u64) {
+        if map::FLASH.contains(&address) {
+            return self.flash.program(address, size, value);
+        }
+        if !self.clocked(address, now) {
+            return self.note(Oddity::Unclocked, address, true);
+        }
+        if let Some(device) = self.devices.iter().find(|device| device.range.contains(&address)) {
+            self.reached = Some(device.irq);
+            let mut model = device.lock();
+            model.write(address - device.range.start, size, value, now);
+            let trigger = model.take_trigger();
+            drop(model);
+            return self.trigger(trigger, now);
+        }
+        let register = address & !3;
+        let value = if size == 4 {
+            value
+        } else {
+            // Part of a register: the rest stays as it reads.
+            let shift = 8 * (address & 3);
+            let mask = ((1 << (8 * size)) - 1) << shift;
+            self.read_register(register, now).unwrap_or(0) & !mask | value << shift & mask
+        };
+        if self.write_register(register, value, now).is_none() {
+            let known = self.read_register(register, now).is_some();
+            self.note(if known { Oddity::Refused } else { Oddity::Unknown }, register, true);
+        }
+        if map::CLOCKS_AND_FLASH.contains(&register) {
+            self.check_wait_states(register, true);
+        }
+    }
+
+    /// Whether flash has the wait states that the core's clock wants, after an access that may have changed either.
+    fn check_wait_states(&mut self, register: u32, write: bool) {
+        if self.flash.access().wait_states < flash::least_wait_states(self.rcc.clocks().hclk_hz) {
+            self.note(Oddity::TooFast, register, write);
+        }
+    }
+
+    fn write_register(&mut self, address: u32, value: u32, now: u64) -> Option<()> {
+        let offset = address % BLOCK;
+        match address - offset {
+            0x4000_0000..=0x4000_1400 => self.timers[block(address, 0x4000_0000)].write(offset, value, now),
+            0x4000_3000 => self.watchdog.write(offset, value, now),
+            CAN1_BASE | 0x4000_6800 => {
+                self.advance_buses(now);
+                self.can.write(address - CAN1_BASE, value, now)
+            }
+            0x4000_7000 => self.power.write(offset, value),
+            0x4001_2000 => self.adc.write(offset, value),
+            0x4001_3800 => self.syscfg.write(offset, value),
+            0x4001_3C00 => self.exti.write(offset, value),
+            GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].write(offset, value),
+            0x4002_3000 => self.crc.write(offset, value),
+            0x4002_3800 => {
+                // What runs from the old clocks runs until now.
+                self.advance(now);
+                let before = self.rcc.read(offset).unwrap_or(0);
+                self.rcc.write(offset, value, now)?;
+                self.follow_clocks(now);
+                self.await_clocks(offset, before, now);
+                if Rcc::is_reset_register(offset) {
+                    self.reset_peripherals(offset, value, now);
+                }
+                Some(())
+            }
+            0x4002_3C00 => self.flash.write(offset, value),
+            0xE004_2000 => self.dbgmcu.write(offset, value),
+            _ => None,
+        }
+    }
+
+    /// A write to a peripheral reset register of the clock controller.
+    fn reset_peripherals(&mut self, offset: u32, value: u32, now: u64) {
+        let set = |bit: usize| value >> bit & 1 != 0;
+        match offset {
+            0x10 => {
+                for port in (0..PORTS).filter(|port| set(*port)) {
+                    self.ports[port] = Gpio::new(port);
+                }
+            }
+            0x14 if set(7) => {
+                let otg = self.devices.iter().find(|device| device.range == map::OTG_FS);
+                if let Some(otg) = otg {
+                    otg.lock().reset(now);
+                }
+            }
+            0x20 => {
+                if set(28) {
+                    self.power = power();
+                }
+                for timer in (0..TIMERS.len()).filter(|timer| set(*timer)) {
+                    self.timers[timer] = self.timers[timer].after_reset();
+                }
+                for controller in (0..2).filter(|controller| set(25 + controller)) {
+                    self.can.reset(controller);
+                }
+            }
+            0x24 => {
+                if set(8) {
+                    self.adc = Adc::default();
+                }
+                if set(14) {
+                    self.syscfg = syscfg(self.boot_mode);
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+fn block(address: u32, base: u32) -> usize {
+    ((address - base) / BLOCK) as usize
+}
+
+/// Power control: the regulator is always ready (VOSRDY).
+fn power() -> Storage {
+    Storage::new(2, &[(1, 1 << 14)])
+}
+
+/// System configuration: MEMRMP tells what the boot pins chose (RM0090, SYSCFG_MEMRMP).
+fn syscfg(boot_mode: u32) -> Storage {
+    let mut syscfg = Storage::new(9, &[]);
+    syscfg.write(0, boot_mode).expect("there are nine registers");
+    syscfg
+}
+
+/// The debug component: IDCODE of an STM32F405 (RM0090 Rev 21 §38.6.1).
+fn dbgmcu() -> Storage {
+    Storage::new(4, &[(0, 0x1007_6413)])
+}
+
+/// The board as the core's bus reaches it.
+pub struct SharedBoard(pub Arc<Mutex<Board>>);
+
+impl SharedBoard {
+    fn lock(&self) -> MutexGuard<'_, Board> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl Bus for SharedBoard {
+    fn read(&self, address: u32, size: u8, now: u64) -> Option<u32> {
+        Some(self.lock().read(address, size, now))
+    }
+
+    fn write(&self, address: u32, size: u8, value: u32, now: u64) -> Option<()> {
+        self.lock().write(address, size, value, now);
+        Some(())
+    }
+
+    fn speeds(&self) -> Speeds {
+        self.lock().speeds()
+    }
+}

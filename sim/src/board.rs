@@ -1,0 +1,15 @@
+//! What the emulator is to know of our boards and of the firmware: clock, crystal, and the interrupts that capture.
+
+use cantap_emu::{Clock, Setup};
+
+/// The firmware's SYSCLK, which is the core's clock.
+pub const CLOCK: Clock = Clock::new(144_000_000);
+/// The Olimex STM32-P405's crystal, in Hz.
+const CRYSTAL_HZ: u64 = 8_000_000;
+/// The interrupts in which the firmware captures CAN1 and CAN2: the one that stamps, and the task that drains (`src/main.rs`).
+pub const CAPTURE_IRQS: [[u16; 2]; 2] = [[20, 21], [64, 11]];
+
+/// The Olimex STM32-P405, with the masking of the interrupts that stamp measured.
+pub fn setup() -> Setup {
+    Setup { watched: 1 << CAPTURE_IRQS[0][0] | 1 << CAPTURE_IRQS[1][0], ..Setup::new(CLOCK, CRYSTAL_HZ) }
+}

@@ -1,7 +1,7 @@
 //! What a capture's summary says of a channel.
 
 use cantap::wire::message::ChannelConfig;
-use cantap::{TraceEvent, TraceRecord, bits_on_bus};
+use cantap::{TraceEvent, TraceRecord};
 use cantap_analysis::stats::WorkLoad;
 
 /// Counts one channel's frames as they are delivered.
@@ -56,7 +56,7 @@ impl Meter {
                     self.intervals += 1;
                 }
                 self.without_data += u64::from(self.omits_data && frame.data_len() > 0);
-                self.load.frame(record.time_ns, bits_on_bus(frame));
+                self.load.frame(record.time_ns, f64::from(frame.bus_bits().total()));
             }
             event if *event == TraceEvent::GAP => {
                 self.latest_ns = None;
@@ -126,7 +126,7 @@ mod tests {
         let mut meter = Meter::of(&config, 36_000_000);
         for (at, text) in frames.iter().enumerate() {
             let frame: Frame = text.parse().unwrap();
-            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
             meter.push(&TraceRecord { time_ns: at as i64 * 1_000_000, channel: 1, event });
         }
         meter

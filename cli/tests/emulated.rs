@@ -131,8 +131,9 @@ fn capture(device: &Device) -> Vec<(u8, Frame, i64)> {
     while frames.last().is_none_or(|(_, frame, _)| number(frame) < FRAMES - 1) {
         let batch = records.next_batch(Duration::from_secs(20)).unwrap().unwrap();
         assert!(!batch.is_empty(), "{} frames, and nothing more", frames.len());
-        let new =
-            batch.iter().filter_map(|record| Some((record.channel, *record.frame()?, record.time_ns / 1000)));
+        let new = batch
+            .iter()
+            .filter_map(|record| Some((record.channel, *record.frame()?.classic()?, record.time_ns / 1000)));
         frames.extend(new);
     }
     frames

@@ -17,7 +17,7 @@ libfuzzer_sys::fuzz_target!(|text: &str| {
     let frame = encode::encode(&decoder, None, text).map(|encoded| encoded.frame);
     if let Ok(mut condition) = Condition::new(text, &decoder) {
         let Ok(frame) = frame.or_else(|_| "001#0102030405060708".parse()) else { return };
-        let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+        let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
         condition.holds(&TraceRecord { time_ns: 0, channel: 1, event });
     }
     let _ = (text.parse::<IdPattern>(), text.parse::<DataPattern>());

@@ -7,7 +7,7 @@ use std::error::Error;
 use std::time::Duration;
 
 use cantap::replay::{Accuracy, Pace, Replay};
-use cantap::{Channel, Device};
+use cantap::{Channel, Device, TraceFrame};
 use cantap_formats::{ReadOptions, open_reader};
 
 /// The bus is given up when nothing leaves for so long.
@@ -19,7 +19,8 @@ pub fn replay(device: &Device, file: &str) -> Result<Accuracy, Box<dyn Error>> {
     let mut replay = Replay::new(device, Pace::default(), [500_000; 2])?;
     for record in open_reader(file, &ReadOptions::default())? {
         let record = record?;
-        if let Some(frame) = record.frame() {
+        // The device is a classical one: CAN FD frames stay here.
+        if let Some(frame) = record.frame().and_then(TraceFrame::classic) {
             replay.push(record.time_ns, Channel::Can1, *frame, |_| true)?;
         }
     }

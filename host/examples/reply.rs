@@ -6,7 +6,7 @@ mod device;
 use std::error::Error;
 
 use cantap::wire::message::{Filter, FrameKind, Trigger, TxFrame};
-use cantap::{Channel, Device, Frame, TraceEvent};
+use cantap::{Channel, Device, Frame, TraceEvent, TraceFrame};
 
 /// Returns the answer as channel 2 received it.
 pub fn ask(device: &Device) -> Result<Frame, Box<dyn Error>> {
@@ -21,7 +21,7 @@ pub fn ask(device: &Device) -> Result<Frame, Box<dyn Error>> {
     let mut asked_ns = None;
     loop {
         let record = records.next().ok_or("the device stopped")??;
-        let TraceEvent::Frame { frame, .. } = record.event else { continue };
+        let TraceEvent::Frame { frame: TraceFrame::Classic(frame), .. } = record.event else { continue };
         if record.channel != Channel::Can2.number() {
             continue;
         }

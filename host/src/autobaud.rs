@@ -18,7 +18,7 @@ use self::hearing::Bounds;
 pub use self::rates::COMMON_BPS;
 use self::rates::{SAME, clocks_of, next_to_study, round_rates, scan_rates, sharpest};
 use crate::device::Records;
-use crate::{Device, DeviceError, Direction, TraceEvent, bits_on_bus};
+use crate::{Device, DeviceError, Direction, TraceEvent, TraceFrame, bits_on_bus};
 
 /// Good frames in a row that make a candidate.
 const GOOD_FRAMES: u32 = 4;
@@ -298,7 +298,9 @@ impl Search<'_> {
             self.records.next_batch(Duration::from_millis(1))?.filter(|batch| !batch.is_empty())
         {
             for record in batch.iter().filter(|record| record.channel == self.channel.number()) {
-                let TraceEvent::Frame { frame, direction: Direction::Rx, late } = &record.event else {
+                let TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction: Direction::Rx, late } =
+                    &record.event
+                else {
                     last_ns = None;
                     continue;
                 };

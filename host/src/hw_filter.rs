@@ -229,7 +229,7 @@ mod tests {
             let text = text.replace(",,", ",").trim_end_matches(',').to_owned();
             let filter: Filter = text.parse().unwrap();
             let compiled = compile(std::slice::from_ref(&filter), Channel::Can1);
-            let accepted = filter.accepts_frame(&frame);
+            let accepted = filter.accepts_frame(&frame.into());
             let passed = hardware_passes(&compiled, &frame);
             prop_assert!(passed || !accepted, "{text} drops {frame}");
             if compiled.remainder.is_none() {

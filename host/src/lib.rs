@@ -17,6 +17,9 @@ pub mod replay;
 pub mod transmit;
 pub mod unsent;
 
-pub use cantap_trace::{Channel, Direction, Frame, FrameBits, Id, TraceEvent, TraceRecord, bits_on_bus};
+pub use cantap_trace::{
+    Channel, Direction, FdBits, FdFrame, Frame, FrameBits, Id, TraceEvent, TraceFrame, TraceRecord,
+    bits_on_bus,
+};
 pub use cantap_wire as wire;
 pub use device::{Device, DeviceError};

@@ -12,7 +12,6 @@ use cantap_wire::{CHANNELS, Channel};
 
 use crate::device::{Records, Transmission};
 use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
-use cantap_trace::bits::bits_on_bus;
 
 /// Frames that are due and of which none ended for so long stand still.
 pub const PATIENCE: Duration = Duration::from_secs(1);
@@ -133,7 +132,7 @@ impl Seen {
                 self.went_off_since = false;
             }
             TraceEvent::Frame { frame, .. } => {
-                self.others_since.add(record.time_ns, bits_on_bus(&frame));
+                self.others_since.add(record.time_ns, frame.bus_bits().total());
             }
             TraceEvent::BusError { kind, .. } => {
                 self.errors.add(kind);
@@ -375,7 +374,7 @@ mod tests {
         let others = frame(Direction::Rx, text);
         // A quarter of each millisecond is not full.
         assert_eq!(cause(seen(&[others; 200], &[]), true), Cause::Unknown);
-        let length_ns = i64::from(bits_on_bus(&text.parse().unwrap())) * 2_000;
+        let length_ns = i64::from(crate::bits_on_bus(&text.parse().unwrap())) * 2_000;
         let mut full = Seen::default();
         for at in 0..1000 {
             full.push(&TraceRecord { time_ns: at * length_ns, channel: 1, event: others });

@@ -75,7 +75,17 @@ fn profile(args: &Args, path: &Path) -> anyhow::Result<Profile> {
 fn name(key: Key) -> String {
     // candump numbers interfaces from 0; no channel is channel 0.
     let channel = key.channel.checked_sub(1).map(|interface| format!("can{interface} ")).unwrap_or_default();
-    format!("{channel}{}{}", key.id, if key.remote { " remote" } else { "" })
+    format!(
+        "{channel}{}{}",
+        key.id,
+        if key.remote {
+            " remote"
+        } else if key.fd {
+            " FD"
+        } else {
+            ""
+        }
+    )
 }
 
 fn print(args: &Args, difference: &Difference, out: &mut impl Write) -> std::io::Result<()> {
@@ -84,13 +94,21 @@ fn print(args: &Args, difference: &Difference, out: &mut impl Write) -> std::io:
             writeln!(out, "{}: only in {} ({count} frames)", name(*key), path.display())?;
         }
     }
-    for Changed { key, period_ns, dlcs, bytes } in &difference.changed {
+    for Changed { key, period_ns, dlcs, flags, bytes } in &difference.changed {
         let name = name(*key);
         if let Some((a, b)) = period_ns {
             writeln!(out, "{name}: period {:.3} ms -> {:.3} ms", a / 1e6, b / 1e6)?;
         }
         if let Some((a, b)) = dlcs {
             writeln!(out, "{name}: DLC {} -> {}", list(a), list(b))?;
+        }
+        if let Some((a, b)) = flags {
+            writeln!(
+                out,
+                "{name}: FD flags {} -> {} (1: switched bit rate, 2: error passive sender)",
+                list(a),
+                list(b)
+            )?;
         }
         for byte in bytes {
             let missing = |bits: &str| if bits.is_empty() { "none".to_owned() } else { bits.to_owned() };
@@ -112,7 +130,8 @@ fn list(dlcs: &[u8]) -> String {
 }
 
 fn to_json(difference: &Difference) -> Value {
-    let kind = |key: Key| json!({ "ch": key.channel, "id": key.id.to_string(), "remote": key.remote });
+    let kind =
+        |key: Key| json!({ "ch": key.channel, "id": key.id.to_string(), "remote": key.remote, "fd": key.fd });
     let only = |only: &[(Key, u64)]| {
         let entries = only.iter().map(|(key, count)| {
             let mut entry = kind(*key);
@@ -125,6 +144,7 @@ fn to_json(difference: &Difference) -> Value {
         let mut entry = kind(changed.key);
         entry["period_ms"] = changed.period_ns.map_or(Value::Null, |(a, b)| json!([a / 1e6, b / 1e6]));
         entry["dlc"] = changed.dlcs.as_ref().map_or(Value::Null, |(a, b)| json!([a, b]));
+        entry["fd_flags"] = changed.flags.as_ref().map_or(Value::Null, |(a, b)| json!([a, b]));
         let bytes = changed.bytes.iter().map(|byte| json!({ "byte": byte.byte, "a": byte.a, "b": byte.b }));
         entry["bytes"] = bytes.collect();
         entry

@@ -9,7 +9,7 @@ use anyhow::{Context, bail};
 use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
-use cantap::{Channel, Device, TraceEvent};
+use cantap::{Channel, Device, TraceEvent, TraceFrame};
 
 use crate::address::Address;
 use crate::channel_args::{self, ChannelArgs};
@@ -173,7 +173,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
     let started = Instant::now();
-    let Played { asked, left_out } = args.play(&source, &mut replay, &mut sending, &mut buses)?;
+    let Played { asked, left_out, fd_left_out } =
+        args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();
     let outcome = sending.outcome(asked)?;
     device.stop()?;
@@ -187,6 +188,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 "failed": outcome.not_sent(),
                 "reason": outcome.reason(),
                 "left_out": left_out,
+                "fd_left_out": fd_left_out,
                 "seconds": seconds,
                 "early_us": accuracy.early_us,
                 "late_us": accuracy.late_us,
@@ -196,6 +198,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         eprint!("cantap: {} frames in {seconds:.1} s", sending.sent());
         if left_out > 0 {
             eprint!(", {left_out} of other channels left out");
+        }
+        if fd_left_out > 0 {
+            eprint!(", {fd_left_out} CAN FD frames left out: the device is a classical one");
         }
         if accuracy.frames > 0 {
             eprint!(
@@ -217,6 +222,8 @@ struct Played {
     asked: u64,
     /// Frames of channels that nothing is sent to.
     left_out: u64,
+    /// CAN FD frames, which the device cannot send.
+    fd_left_out: u64,
 }
 
 /// What is played, and where to.
@@ -301,6 +308,10 @@ impl Args {
                 let TraceEvent::Frame { frame, .. } = record.event else {
                     continue;
                 };
+                let TraceFrame::Classic(frame) = frame else {
+                    played.fd_left_out += 1;
+                    continue;
+                };
                 let Some(channel) = source.target(record.channel) else {
                     played.left_out += 1;
                     continue;
@@ -318,6 +329,12 @@ impl Args {
                 if replay.push(last_ns, channel, frame, goes_on)? {
                     sending.goes_on(&replay.take_ended(), replay.oldest_due());
                 }
+            }
+            if played.asked == 0 && played.fd_left_out > 0 && !interrupt::requested() {
+                bail!(
+                    "'{}' has only CAN FD frames for these channels, which a classical device cannot send",
+                    source.input.display()
+                );
             }
             if played.asked == 0 && !interrupt::requested() {
                 bail!(

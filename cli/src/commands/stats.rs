@@ -23,6 +23,7 @@ use crate::input::ReadArgs;
 #[command(after_help = "Examples:\n  \
     cantap stats trace.log -b 500k\n  \
     cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
+    cantap stats fd.asc -b 500k --data-bitrate 2M\n  \
     cantap stats -d virtual -b 1M -t 10\n\n\
 A frame's load is its exact length, stuff bits and intermission included, over the time since the frame\n\
 before. Windows also count error frames, with their least length. Where frames were lost, the load is a\n\
@@ -38,6 +39,15 @@ pub struct Args {
     /// repeated. A file has no load without it.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE", required_unless_present = "input")]
     bitrates: Vec<ChannelBitrate>,
+    /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), that channel's only. Can be
+    /// repeated. Without it a channel with switched bit rates has no load.
+    #[arg(
+        long = "data-bitrate",
+        value_name = "[CHANNEL:]BITRATE",
+        conflicts_with = "device",
+        requires = "bitrates"
+    )]
+    data_bitrates: Vec<ChannelBitrate>,
     /// The device's channel to listen to: 1, 2 or both.
     #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
     channel: args::Channels,
@@ -62,7 +72,13 @@ pub struct Args {
 
 impl Args {
     fn options(&self) -> Options {
-        Options { window: self.window, ..ChannelBitrate::options(&self.bitrates) }
+        let data = ChannelBitrate::options(&self.data_bitrates);
+        Options {
+            window: self.window,
+            data_bitrate_bps: data.bitrate_bps,
+            channel_data_bitrate_bps: data.channel_bitrate_bps,
+            ..ChannelBitrate::options(&self.bitrates)
+        }
     }
 }
 

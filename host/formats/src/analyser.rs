@@ -116,7 +116,10 @@ mod tests {
 
         #[test]
         fn frames_of_channel_1_lose_nothing(frames in prop::collection::vec(frame(), 0..12)) {
-            let event = |frame| TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            let event = |frame: cantap_trace::Frame| {
+                let frame = frame.into();
+                TraceEvent::Frame { frame, direction: Direction::Rx, late: false }
+            };
             let record = |(at, frame)| TraceRecord { time_ns: at as i64, channel: 1, event: event(frame) };
             let records: Vec<_> = frames.into_iter().enumerate().map(record).collect();
             prop_assert_eq!(tests::round_trip(CSV, &records), records.clone());

@@ -1,12 +1,13 @@
 //! Vector's BLF: objects in compressed containers behind a header of 144 bytes.
 //!
 //! Vector publishes no description. What is known comes from Tobias Lorenz's vector_blf and from
-//! python-can; field names follow them. Written are CAN_MESSAGE, CAN_ERROR_EXT, DATA_LOST_END, and
+//! python-can; field names follow them. Written are CAN_MESSAGE, CAN_FD_MESSAGE, CAN_ERROR_EXT, DATA_LOST_END, and
 //! EVENT_COMMENT for what has no object of its own. A container that is on the disk can be read
 //! whatever happens afterwards: the header's totals are for information.
 
 mod decode;
 mod encode;
+mod kinds;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
@@ -52,6 +53,16 @@ const SENT: u8 = 1;
 const REQUESTED: u8 = 2;
 const REMOTE: u8 = 0x80;
 
+// A CAN FD object's own flags.
+const FD_FORMAT: u8 = 1;
+const FD_SWITCHED_BIT_RATE: u8 = 2;
+const FD_PASSIVE_SENDER: u8 = 4;
+// The longer object's.
+const FD64_REMOTE: u32 = 1 << 4;
+const FD64_FORMAT: u32 = 1 << 12;
+const FD64_SWITCHED_BIT_RATE: u32 = 1 << 13;
+const FD64_PASSIVE_SENDER: u32 = 1 << 14;
+
 /// In an error object: the SJA1000's error code is valid.
 const HAS_SJA1000_CODE: u32 = 1;
 /// Ours, in the data bytes of an error object whose length is 0: this mark, then the kind from 1, whether
@@ -63,7 +74,7 @@ mod tests {
     use super::super::tests;
     use crate::{Format, WriteOptions};
     use cantap_trace::TraceRecord;
-    use cantap_trace::testing::{data_record, record};
+    use cantap_trace::testing::{data_record, record_or_fd};
     use proptest::prelude::*;
 
     fn file(records: &[TraceRecord]) -> Vec<u8> {
@@ -73,10 +84,67 @@ mod tests {
 
     proptest! {
         #[test]
-        fn any_trace_in_order_round_trips(mut records in prop::collection::vec(record(1), 0..20)) {
+        fn any_trace_in_order_round_trips(mut records in prop::collection::vec(record_or_fd(1), 0..20)) {
             records.sort_by_key(|record| record.time_ns);
             prop_assert_eq!(tests::round_trip(Format::Blf, &records), records);
         }
+    }
+
+    /// A file of one object.
+    fn object(kind: u32, header_version: u16, fields: &[u8]) -> Vec<u8> {
+        let mut bytes = file(&[]);
+        bytes.truncate(super::FILE_HEADER_BYTES);
+        bytes[16..24].fill(0);
+        let len = (super::HEADER_BYTES + fields.len()) as u32;
+        let mut header = [0; super::HEADER_BYTES];
+        header[..4].copy_from_slice(super::OBJECT_MAGIC);
+        header[4..6].copy_from_slice(&(super::HEADER_BYTES as u16).to_le_bytes());
+        header[6..8].copy_from_slice(&header_version.to_le_bytes());
+        header[8..12].copy_from_slice(&len.to_le_bytes());
+        header[12..16].copy_from_slice(&kind.to_le_bytes());
+        header[16] = super::TIME_IN_NS as u8;
+        bytes.extend(header);
+        bytes.extend(fields);
+        bytes
+    }
+
+    #[test]
+    fn what_is_not_can_is_counted_by_its_kind() {
+        let options = crate::ReadOptions::default();
+        let mut bytes = object(11, 1, &[0; 16]);
+        for kind in [71, 71, 92, 3, 200, 115] {
+            bytes.extend(&object(kind, 1, &[0; 16])[super::FILE_HEADER_BYTES..]);
+        }
+        let source = std::io::Cursor::new(bytes);
+        let mut reader = crate::TraceReader::from_source("test", source, Format::Blf, &options).unwrap();
+        assert_eq!(reader.by_ref().count(), 0);
+        let expected = [
+            ("CAN overload frames", 1),
+            ("Ethernet frames and events", 2),
+            ("LIN frames and events", 1),
+            ("comments and texts", 1),
+            ("objects of other kinds", 1),
+        ];
+        assert_eq!(reader.left_out().iter().collect::<Vec<_>>(), expected);
+    }
+
+    #[test]
+    fn channels_that_do_not_fit_and_unknown_headers_are_issues() {
+        let mut message = [0; 16];
+        message[..2].copy_from_slice(&300_u16.to_le_bytes());
+        let (records, issues) = tests::read(Format::Blf, object(1, 1, &message));
+        assert_eq!(records, []);
+        assert_eq!(issues, ["test, offset 0x90: expected a channel of 0 to 255, found '300'"]);
+        message[..2].copy_from_slice(&255_u16.to_le_bytes());
+        assert_eq!(tests::read(Format::Blf, object(1, 1, &message)).0[0].channel, 255);
+        message[..2].copy_from_slice(&0_u16.to_le_bytes());
+        assert_eq!(tests::read(Format::Blf, object(1, 1, &message)).0[0].channel, 0);
+        let (records, issues) = tests::read(Format::Blf, object(1, 9, &message));
+        assert_eq!(records, []);
+        assert_eq!(
+            issues,
+            ["test, offset 0x90: expected an object's header of version 1 or 2, found 'version 9'"]
+        );
     }
 
     #[test]

@@ -15,8 +15,9 @@ use super::issue::Fault;
 use super::left_out::LeftOut;
 use super::line::{Line, Seconds};
 use super::text::{self, NS_PER_S};
+use cantap_trace::fd::{FD_MAX_BYTES, FLAG_BRS, FLAG_ESI, FLAG_FDF};
 use cantap_trace::socketcan::{BUS_ERROR, ERROR_FLAG, ErrorFrame};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEEF'";
 
@@ -48,7 +49,7 @@ impl Decode for Decoder {
                 Ok((record, second)) => {
                     self.end_missing = !line.terminated;
                     if let Some(frame) = record.frame().filter(|frame| !frame.is_remote()) {
-                        self.lengths.note(frame);
+                        self.lengths.note(frame.id(), frame.dlc());
                     }
                     self.error_frames.keep(second.map(|event| TraceRecord { event, ..record }));
                     Found::Record(record)
@@ -131,8 +132,8 @@ impl Decoder {
         // Only now: a line that is refused must not name an interface.
         let channel = self.interfaces.channel(interface);
         let frame = Frame::from_bus(id, false, len, data);
-        self.lengths.note(&frame);
-        let event = TraceEvent::Frame { frame, direction, late: false };
+        self.lengths.note(id, len);
+        let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
         Some((TraceRecord { time_ns, channel, event }, text.len() - rest.len()))
     }
 
@@ -164,9 +165,6 @@ impl Decoder {
             other => return Err(Fault::malformed("'R', 'T' or nothing behind the frame", other)),
         };
         let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
-        if data.first() == Some(&b'#') {
-            return Err(Fault::Unsupported("a CAN FD frame".into()));
-        }
         let channel = self.interfaces.channel(interface);
         if id.len() == 8 && raw & ERROR_FLAG != 0 {
             let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
@@ -181,7 +179,12 @@ impl Decoder {
         let id = id.ok_or_else(|| {
             Fault::malformed("an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF", frame)
         })?;
-        let frame = payload(id, data)?;
+        let frame = match data {
+            [b'#', fd @ ..] => flexible(id, fd).ok_or_else(|| {
+                Fault::malformed("a CAN FD frame such as 123##1DEADBEEF, with a length that FD has", frame)
+            })?,
+            _ => payload(id, data)?.into(),
+        };
         let event = TraceEvent::Frame { frame, direction, late: false };
         Ok((TraceRecord { time_ns, channel, event }, None))
     }
@@ -203,9 +206,9 @@ impl Lengths {
     }
 
     #[inline]
-    fn note(&mut self, frame: &Frame) {
-        let (place, key) = Self::key(frame.id());
-        self.0[place] = (key, frame.dlc());
+    fn note(&mut self, id: Id, dlc: u8) {
+        let (place, key) = Self::key(id);
+        self.0[place] = (key, dlc);
     }
 
     /// 0 if it is not known.
@@ -243,6 +246,26 @@ fn bytes(mut digits: &[u8]) -> Option<([u8; 8], u8)> {
         };
     }
     digits.is_empty().then_some((data, len as u8))
+}
+
+/// What follows the `##`: a digit of flags, then the data. `None` if it is not that.
+fn flexible(id: Id, text: &[u8]) -> Option<TraceFrame> {
+    let (flags, mut digits) = text.split_first()?;
+    let flags = text::hex_digit(*flags).filter(|flags| flags & !(FLAG_BRS | FLAG_ESI | FLAG_FDF) == 0)?;
+    let mut data = [0; FD_MAX_BYTES];
+    let mut len = 0;
+    while let [high, low, rest @ ..] = digits {
+        *data.get_mut(len)? = text::hex_pair(*high, *low)?;
+        len += 1;
+        digits = match rest {
+            [b'.', more @ ..] if !more.is_empty() => more,
+            _ => rest,
+        };
+    }
+    if !digits.is_empty() {
+        return None;
+    }
+    FdFrame::new(id, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, &data[..len]).map(TraceFrame::Fd)
 }
 
 /// What follows the `#`.
@@ -285,7 +308,17 @@ impl Encode for Encoder {
         line.put(b" ");
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
-                put_frame(&mut line, frame);
+                match frame {
+                    TraceFrame::Classic(frame) => put_frame(&mut line, frame),
+                    TraceFrame::Fd(frame) => {
+                        put_id(&mut line, frame.id());
+                        line.put(b"##");
+                        line.put_hex(u32::from(frame.flags()));
+                        // Longer than a line that is built in place.
+                        std::mem::replace(&mut line, Line::new()).end(out);
+                        frame.data().iter().for_each(|byte| text::push_hex_byte(out, *byte));
+                    }
+                }
                 if *direction == Direction::Tx {
                     line.put(b" T");
                 }
@@ -310,13 +343,7 @@ impl Encode for Encoder {
 /// `123#DEADBEEF`.
 #[inline]
 fn put_frame(line: &mut Line, frame: &Frame) {
-    let id = frame.id();
-    let digits = text::hex_digits_of(id.raw());
-    if id.is_extended() {
-        line.put(&digits);
-    } else {
-        line.put(&[digits[5], digits[6], digits[7]]);
-    }
+    put_id(line, frame.id());
     line.put(b"#");
     if frame.is_remote() {
         line.put(b"R");
@@ -331,16 +358,27 @@ fn put_frame(line: &mut Line, frame: &Frame) {
     }
 }
 
+/// Three digits or eight.
+#[inline]
+fn put_id(line: &mut Line, id: Id) {
+    let digits = text::hex_digits_of(id.raw());
+    if id.is_extended() {
+        line.put(&digits);
+    } else {
+        line.put(&[digits[5], digits[6], digits[7]]);
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::super::tests;
     use crate::Format;
-    use cantap_trace::testing::record;
+    use cantap_trace::testing::record_or_fd;
     use proptest::prelude::*;
 
     proptest! {
         #[test]
-        fn any_trace_round_trips(records in prop::collection::vec(record(1000), 0..20)) {
+        fn any_trace_round_trips(records in prop::collection::vec(record_or_fd(1000), 0..20)) {
             prop_assert_eq!(tests::round_trip(Format::Candump, &records), records);
         }
 
@@ -402,6 +440,8 @@ mod tests {
                    (0.000000) can1 123#R3\n\
                    (1.000001) can0 123# T\n\
                    (1.000001) can0 7FF#1122334455667788_F\n\
+                   (1.000002) can0 7FF##3112233445566778899AABBCC T\n\
+                   (1.000003) can0 18DAF110##0\n\
                    (-0.500000) can0 000#00\n";
         let (records, issues) = tests::read(Format::Candump, log);
         assert_eq!(issues, Vec::<String>::new());
@@ -410,7 +450,7 @@ mod tests {
 
     #[test]
     fn broken_lines_are_named_and_the_rest_is_read() {
-        let log = "# a comment\n\n(1.0) can0 123#11\n(x) can0 123#11\nnonsense\n(2.0) can0 123##111\n\
+        let log = "# a comment\n\n(1.0) can0 123#11\n(x) can0 123#11\nnonsense\n(2.0) can0 123##111111111111111111\n\
                    (2.0) can0 800#\n(2.0) can0 123#1\n(2.0) can0 123#11 Q\r\n(3.0) can0 123#5.6\n(4) can3 123#r";
         let (records, issues) = tests::read(Format::Candump, log);
         assert_eq!(records.len(), 2);
@@ -419,7 +459,7 @@ mod tests {
             [
                 "test, line 4: expected a time in seconds between the parentheses, found 'x'",
                 "test, line 5: expected a log line such as '(1410714882.622188) can0 123#DEADBEEF', found 'nonsense'",
-                "test, line 6: a CAN FD frame cannot be represented and is left out",
+                "test, line 6: expected a CAN FD frame such as 123##1DEADBEEF, with a length that FD has, found '123##111111111111111111'",
                 "test, line 7: expected an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF, found '800#'",
                 "test, line 8: expected a frame such as 123#DEADBEEF (the data must be pairs of hexadecimal digits, with '.' between pairs if you like), found '123#1'",
                 "test, line 9: expected 'R', 'T' or nothing behind the frame, found 'Q'",

@@ -18,8 +18,9 @@ use super::input::Input;
 use super::issue::{Fault, Place};
 use super::left_out::LeftOut;
 use super::text::{self, NS_PER_S};
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::socketcan::ErrorFrame;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Which columns.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -34,6 +35,8 @@ pub enum CsvDialect {
 }
 
 const PYTHON_CAN_HEAD: &str = "timestamp,arbitration_id,extended,remote,error,dlc,data";
+/// Types of CAN FD frames in our own dialect, by their flags.
+const FD_KINDS: [&str; 4] = ["fd", "fd-brs", "fd-esi", "fd-brs-esi"];
 const FULL_HEAD: &str = "time,channel,direction,type,id,dlc,data,event";
 
 /// Reads any dialect.
@@ -155,15 +158,25 @@ fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault>
     let parsed = parsed.ok_or_else(|| Fault::malformed("an identifier that fits its format", id))?;
     let remote = remote == b"1";
     let number = text::decimal(dlc).ok_or_else(|| Fault::malformed("a length", dlc))?;
+    let data_event =
+        |frame| Ok(Some((record(TraceEvent::Frame { frame, direction: Direction::Rx, late: false }), None)));
+    // There is no column for FD: a longer frame is one, and only that much is known of it.
+    if bytes.len() > 8
+        && !remote
+        && number == bytes.len() as u64
+        && let Some(frame) = FdFrame::new(parsed, false, false, &bytes)
+    {
+        return data_event(TraceFrame::Fd(frame));
+    }
     if bytes.len() > 8 || number > 15 {
-        return Err(Fault::Unsupported("a CAN FD frame".into()));
+        return Err(Fault::malformed("a length that CAN or CAN FD has, and as many bytes", line));
     }
     let expected = number.min(8) as usize;
     if !remote && present != expected {
         return Err(Fault::malformed(format!("{expected} data bytes"), data));
     }
     let frame = Frame::from_bus(parsed, remote, number as u8, padded);
-    Ok(Some((record(TraceEvent::Frame { frame, direction: Direction::Rx, late: false }), None)))
+    data_event(frame.into())
 }
 
 /// A time as Python writes a float: `1.5`, and for small ones `9.7e-05`.
@@ -190,10 +203,17 @@ fn full(line: &[u8]) -> Result<TraceRecord, Fault> {
             parsed.map_err(|_| Fault::malformed("an event such as 'lost 5 queue'", event))?;
         return Ok(TraceRecord { time_ns, channel, event });
     }
+    let fd = FD_KINDS.iter().position(|known| known.as_bytes() == kind);
     let remote = match kind {
         b"data" => false,
         b"remote" => true,
-        other => return Err(Fault::malformed("a type: data, remote or event", other)),
+        _ if fd.is_some() => false,
+        other => {
+            return Err(Fault::malformed(
+                "a type: data, remote, fd, fd-brs, fd-esi, fd-brs-esi or event",
+                other,
+            ));
+        }
     };
     let direction = match direction {
         b"Rx" => Direction::Rx,
@@ -205,8 +225,12 @@ fn full(line: &[u8]) -> Result<TraceRecord, Fault> {
     let number = text::decimal(dlc)
         .filter(|dlc| *dlc <= 15)
         .ok_or_else(|| Fault::malformed("a data length code of 0 to 15", dlc))? as u8;
-    let expected = if remote { 0 } else { usize::from(number.min(8)) };
-    let mut bytes = [0; 8];
+    let expected = match fd {
+        _ if remote => 0,
+        Some(_) => usize::from(FD_LENGTHS[usize::from(number)]),
+        None => usize::from(number.min(8)),
+    };
+    let mut bytes = [0; FD_MAX_BYTES];
     let pairs = data.chunks(2).map(|pair| match pair {
         [high, low] => text::hex_pair(*high, *low),
         _ => None,
@@ -218,7 +242,13 @@ fn full(line: &[u8]) -> Result<TraceRecord, Fault> {
     for (slot, byte) in bytes.iter_mut().zip(pairs) {
         *slot = byte.ok_or_else(wrong)?;
     }
-    let frame = Frame::from_bus(parsed, remote, number, bytes);
+    let frame = match fd {
+        Some(flags) => {
+            FdFrame::new(parsed, flags & 1 != 0, flags & 2 != 0, &bytes[..expected]).map(TraceFrame::Fd)
+        }
+        None => bytes.first_chunk().map(|data| Frame::from_bus(parsed, remote, number, *data).into()),
+    };
+    let frame = frame.ok_or_else(wrong)?;
     let event = TraceEvent::Frame { frame, direction, late: event == b"late" };
     Ok(TraceRecord { time_ns, channel, event })
 }
@@ -300,7 +330,18 @@ impl Encode for PythonCanEncoder {
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
                 let id = frame.id();
-                row(id.raw(), [id.is_extended(), frame.is_remote(), false], frame.dlc(), frame.data());
+                let len = if frame.is_fd() { frame.data_len() as u8 } else { frame.dlc() };
+                row(id.raw(), [id.is_extended(), frame.is_remote(), false], len, frame.data());
+                if let TraceFrame::Fd(frame) = frame {
+                    if frame.data_len() <= 8 {
+                        left_out.note(
+                            "that short CAN FD frames are such, which python-can's CSV has no column for",
+                        );
+                    }
+                    if frame.flags() != 0 {
+                        left_out.note("the flags of CAN FD frames, which python-can's CSV has no column for");
+                    }
+                }
                 if *direction == Direction::Tx {
                     left_out.note("the direction of sent frames, which python-can's CSV has no column for");
                 }
@@ -346,7 +387,12 @@ impl Encode for FullEncoder {
         match &record.event {
             TraceEvent::Frame { frame, direction, late } => {
                 out.extend_from_slice(if *direction == Direction::Tx { b",Tx," } else { b",Rx," });
-                out.extend_from_slice(if frame.is_remote() { b"remote," } else { b"data," });
+                out.extend_from_slice(match frame {
+                    TraceFrame::Fd(frame) => FD_KINDS[usize::from(frame.flags() & 3)].as_bytes(),
+                    TraceFrame::Classic(frame) if frame.is_remote() => b"remote",
+                    TraceFrame::Classic(_) => b"data",
+                });
+                out.push(b',');
                 let id = frame.id();
                 text::push_hex(out, id.raw(), if id.is_extended() { 8 } else { 3 });
                 out.push(b',');
@@ -371,7 +417,7 @@ mod tests {
     use super::super::tests;
     use super::*;
     use crate::{Format, WriteOptions};
-    use cantap_trace::testing::record;
+    use cantap_trace::testing::{record, record_or_fd};
     use proptest::prelude::*;
 
     proptest! {
@@ -402,6 +448,11 @@ mod tests {
         }
 
         #[test]
+        fn our_own_dialect_keeps_fd_frames(records in prop::collection::vec(record_or_fd(1), 0..20)) {
+            prop_assert_eq!(tests::round_trip(Format::Csv(CsvDialect::Full), &records), records);
+        }
+
+        #[test]
         fn base64_round_trips(bytes in prop::collection::vec(any::<u8>(), 0..=64)) {
             let mut text = Vec::new();
             push_base64(&mut text, &bytes);
@@ -424,6 +475,35 @@ mod tests {
             tests::write(Format::Csv(CsvDialect::Full), &records),
             "time,channel,direction,type,id,dlc,data,event\n\
              1483389946.197000,1,Rx,data,00DADADA,7,5B34322C20395D,\n"
+        );
+    }
+
+    /// python-can writes a longer frame with its length and its bytes, and nothing else that tells FD.
+    #[test]
+    fn python_cans_dialect_keeps_the_data_of_fd_frames_and_counts_what_it_has_no_column_for() {
+        let log = "(1.000000) can0 123##1000102030405060708090A0B\n(2.000000) can0 124##0AA\n";
+        let (records, _) = tests::read(Format::Candump, log);
+        let options =
+            WriteOptions { format: Some(Format::Csv(CsvDialect::PythonCan)), ..WriteOptions::default() };
+        let (bytes, left_out) = tests::write_with(&options, &records);
+        let (read, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), bytes);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            tests::write(Format::Candump, &read),
+            "(1.000000) can0 123##0000102030405060708090A0B\n(2.000000) can0 124#AA\n"
+        );
+        let counts: Vec<_> = left_out.iter().collect();
+        assert_eq!(
+            counts,
+            [
+                ("that short CAN FD frames are such, which python-can's CSV has no column for", 1),
+                ("the flags of CAN FD frames, which python-can's CSV has no column for", 1),
+            ]
+        );
+        let bad = "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.0,0x1,0,0,0,9,AAAAAAAAAAAA\n";
+        assert!(
+            tests::read(Format::Csv(CsvDialect::PythonCan), bad).1[0]
+                .contains("a length that CAN or CAN FD has")
         );
     }
 

@@ -11,6 +11,8 @@ pub(crate) enum Found {
     Issue(Place, Fault),
     /// Nothing wrong, but something that the user should know, to be counted.
     Note(&'static str),
+    /// Something well-formed that a trace of CAN does not hold, such as a LIN frame: left out, and counted by its kind.
+    LeftOut(&'static str),
     /// The end.
     End,
 }

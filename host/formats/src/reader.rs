@@ -50,6 +50,7 @@ pub struct TraceReader {
     strict: bool,
     issues: u64,
     notes: LeftOut,
+    left_out: LeftOut,
     ended: bool,
 }
 
@@ -109,6 +110,7 @@ impl TraceReader {
             strict,
             issues: 0,
             notes: LeftOut::default(),
+            left_out: LeftOut::default(),
             ended: false,
         }
     }
@@ -152,6 +154,11 @@ impl TraceReader {
         &self.notes
     }
 
+    /// What of the file is well-formed and no part of a CAN trace, such as LIN frames or markers: so far, by kind.
+    pub fn left_out(&self) -> &LeftOut {
+        &self.left_out
+    }
+
     fn issue(&mut self, place: Place, fault: Fault) -> ReadIssue {
         self.issues += 1;
         self.ended |= self.strict || matches!(fault, Fault::Io(_));
@@ -176,6 +183,10 @@ impl TraceReader {
             }
             Ok(Found::Note(what)) => {
                 self.notes.note(what);
+                Beyond::Batch
+            }
+            Ok(Found::LeftOut(what)) => {
+                self.left_out.note(what);
                 Beyond::Batch
             }
             Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),

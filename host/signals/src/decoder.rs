@@ -2,7 +2,8 @@
 
 use std::collections::HashMap;
 
-use cantap_wire::{Frame, Id};
+use cantap_trace::TraceFrame;
+use cantap_wire::Id;
 use rustc_hash::FxHashMap;
 
 use super::model::{Database, Message, Signal};
@@ -185,7 +186,12 @@ impl Decoder {
 
     /// Decodes a frame: `values` is emptied and gets the chosen signals that are there and that
     /// fit the frame. `None` for remote frames and for identifiers of no message.
-    pub fn decode(&self, channel: u8, frame: &Frame, values: &mut Vec<SignalValue>) -> Option<MessageRef> {
+    pub fn decode(
+        &self,
+        channel: u8,
+        frame: &TraceFrame,
+        values: &mut Vec<SignalValue>,
+    ) -> Option<MessageRef> {
         values.clear();
         if frame.is_remote() {
             return None;

@@ -3,10 +3,10 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_wire::{Frame, Id};
+use cantap_wire::Id;
 
 use crate::condition::Condition;
-use cantap_trace::TraceRecord;
+use cantap_trace::{TraceFrame, TraceRecord};
 
 /// What to look for. Everything that is given must hold.
 #[derive(Clone, Debug, Default)]
@@ -32,7 +32,7 @@ impl Search {
         }
     }
 
-    fn suits(&self, frame: &Frame) -> bool {
+    fn suits(&self, frame: &TraceFrame) -> bool {
         (self.ids.is_empty() || self.ids.iter().any(|pattern| pattern.matches(frame.id())))
             && (self.data.is_empty() || self.data.iter().any(|pattern| pattern.matches(frame)))
     }
@@ -132,7 +132,7 @@ pub struct DataPattern {
 
 impl DataPattern {
     /// Whether a frame's data is meant. Remote frames have none.
-    pub fn matches(&self, frame: &Frame) -> bool {
+    pub fn matches(&self, frame: &TraceFrame) -> bool {
         let mut data = frame.data();
         for (at, piece) in self.pieces.iter().enumerate() {
             let suits =
@@ -244,7 +244,7 @@ mod tests {
             ("100-1FF", "200#", false),
             ("100-1FF", "00000180#", false),
         ] {
-            let id = frame.parse::<Frame>().unwrap().id();
+            let id = frame.parse::<TraceFrame>().unwrap().id();
             assert_eq!(pattern.parse::<IdPattern>().unwrap().matches(id), expected, "{pattern} {frame}");
         }
         for wrong in ["", "12", "1234", "800", "20000000", "200-100", "100-00000200", "12g", "-"] {

@@ -157,7 +157,7 @@ mod tests {
         let mut kept = Vec::new();
         for number in numbers {
             let id = cantap_trace::Id::standard(1).unwrap();
-            let frame = cantap_trace::Frame::data_frame(id, &[number]).unwrap();
+            let frame = cantap_trace::Frame::data_frame(id, &[number]).unwrap().into();
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
             let record = TraceRecord { time_ns: i64::from(number) * SECOND, channel: 1, event };
             let Ok(()) = trigger.push(&record, |record| {

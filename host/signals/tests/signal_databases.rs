@@ -3,7 +3,7 @@
 use cantap_signals::{
     Colour, Database, DatabaseError, Decoder, Digital, Selection, Source, dbc, encode, file,
 };
-use cantap_trace::Frame;
+use cantap_trace::TraceFrame;
 
 fn decoder(database: Database) -> Decoder {
     Decoder::new(vec![Source { channel: None, database }])
@@ -11,7 +11,7 @@ fn decoder(database: Database) -> Decoder {
 
 /// `Name=value` for each decoded signal, `None` if the frame is unknown.
 fn decode(decoder: &Decoder, channel: u8, frame: &str) -> Option<String> {
-    let frame: Frame = frame.parse().unwrap();
+    let frame: TraceFrame = frame.parse().unwrap();
     let mut values = Vec::new();
     let message = decoder.message(decoder.decode(channel, &frame, &mut values)?);
     let texts = values.iter().map(|value| {

@@ -130,7 +130,7 @@ fn use_it(database: Database) {
     let mut values = Vec::new();
     for id in ids {
         for data in [&[][..], &[0xA5; 3], &[0xFF; 8], &[0; 8]] {
-            let frame = Frame::data_frame(id, data).unwrap();
+            let frame = Frame::data_frame(id, data).unwrap().into();
             if let Some(message) = decoder.decode(1, &frame, &mut values) {
                 for value in &values {
                     let signal = &decoder.message(message).signals[value.signal as usize];
@@ -182,7 +182,7 @@ proptest! {
         let text = pieces.join(" ") + &noise;
         let database = dbc::parse("x.dbc", b"BO_ 1 A: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n").unwrap();
         let decoder = Decoder::new(vec![Source { channel: None, database }]);
-        let frame = Frame::data_frame("001".parse().unwrap(), &frame).unwrap();
+        let frame = Frame::data_frame("001".parse().unwrap(), &frame).unwrap().into();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
         match Condition::new(&text, &decoder) {
             Ok(mut condition) => { condition.holds(&TraceRecord { time_ns: 0, channel: 1, event }); }

@@ -56,7 +56,7 @@ proptest! {
         let encoded = encode::encode(&decoder, None, &format!("M:S={number}"));
         let encoded = encoded.map_err(|error| TestCaseError::fail(format!("{number}: {error}")))?;
         let mut values = Vec::new();
-        decoder.decode(1, &encoded.frame, &mut values).unwrap();
+        decoder.decode(1, &encoded.frame.into(), &mut values).unwrap();
         prop_assert_eq!(signal.number(values[0].raw), number);
         // Minus zero and zero are the same number.
         let only_the_sign = raw == 1 << (signal.length - 1);
@@ -82,7 +82,7 @@ proptest! {
         let frame = encode::encode(&decoder, None, &format!("M:Deep={value}")).unwrap().frame;
         prop_assert_eq!(frame.data()[..3].to_vec(), vec![outer as u8, inner as u8, value as u8]);
         let mut values = Vec::new();
-        decoder.decode(1, &frame, &mut values).unwrap();
+        decoder.decode(1, &frame.into(), &mut values).unwrap();
         let mut found: Vec<_> = values.iter().map(|value| (value.signal, value.raw)).collect();
         found.sort_unstable();
         prop_assert_eq!(found, vec![(0, value), (1, inner), (2, outer)]);

@@ -167,7 +167,7 @@ impl Intake {
                     time_ns: ticks as i64,
                     channel: received.channel.number(),
                     event: TraceEvent::Frame {
-                        frame: received.frame,
+                        frame: received.frame.into(),
                         direction: Direction::Rx,
                         late: received.stamp != Stamp::Exact,
                     },
@@ -349,7 +349,7 @@ fn on_event(
         Event::Transmitted { channel, tag, frame } => {
             let time_ns = clock.utc(Ticks(ticks)).0;
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
-            (channel, TraceEvent::Frame { frame, direction: Direction::Tx, late: false })
+            (channel, TraceEvent::Frame { frame: frame.into(), direction: Direction::Tx, late: false })
         }
         Event::TransmitFailed { channel, tag, reason } => {
             let time_ns = clock.utc(Ticks(ticks)).0;

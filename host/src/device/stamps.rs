@@ -7,7 +7,6 @@
 use cantap_wire::CHANNELS;
 
 use crate::{TraceEvent, TraceRecord};
-use cantap_trace::bits::bits_on_bus;
 
 /// A bit's length on each channel, while it is open.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -48,7 +47,7 @@ pub fn tighten(records: &mut [TraceRecord], lengths: &BitLengths) {
             continue;
         }
         record.time_ns = record.time_ns.min(limit[channel]);
-        limit[channel] = record.time_ns - lengths.ticks(channel, bits_on_bus(frame));
+        limit[channel] = record.time_ns - lengths.ticks(channel, frame.bus_bits().total());
     }
 }
 

@@ -5,11 +5,12 @@
 
 use std::collections::BTreeMap;
 
-use cantap_wire::{Frame, Id};
+use cantap_wire::Id;
 
-use crate::TraceRecord;
+use crate::fd::FD_MAX_BYTES;
+use crate::{TraceFrame, TraceRecord};
 
-/// A kind of frame: channel, identifier, and whether it is remote.
+/// A kind of frame: channel, identifier, and whether it is remote, or an FD one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Key {
     /// From 1; 0 if channels are not told apart.
@@ -18,6 +19,8 @@ pub struct Key {
     pub id: Id,
     /// Whether these are remote frames.
     pub remote: bool,
+    /// Whether these are CAN FD frames.
+    pub fd: bool,
 }
 
 /// Everything about one kind of frame.
@@ -29,10 +32,12 @@ pub struct IdProfile {
     last_ns: i64,
     /// Bit n: a frame with DLC n was there.
     dlcs: u16,
+    /// Bit n: an FD frame with flags n was there.
+    flags: u8,
     /// Bits that were 1 in every frame that has them.
-    always: [u8; 8],
+    always: [u8; FD_MAX_BYTES],
     /// Bits that were 1 in any frame.
-    ever: [u8; 8],
+    ever: [u8; FD_MAX_BYTES],
     /// How many bytes the longest frame has.
     len: u8,
 }
@@ -51,17 +56,21 @@ impl IdProfile {
             first_ns: time_ns,
             last_ns: time_ns,
             dlcs: 0,
-            always: [0xFF; 8],
-            ever: [0; 8],
+            flags: 0,
+            always: [0xFF; FD_MAX_BYTES],
+            ever: [0; FD_MAX_BYTES],
             len: 0,
         }
     }
 
-    fn add(&mut self, time_ns: i64, frame: &Frame) {
+    fn add(&mut self, time_ns: i64, frame: &TraceFrame) {
         self.count += 1;
         self.first_ns = self.first_ns.min(time_ns);
         self.last_ns = self.last_ns.max(time_ns);
         self.dlcs |= 1 << frame.dlc();
+        if let Some(frame) = frame.fd() {
+            self.flags |= 1 << frame.flags();
+        }
         self.len = self.len.max(frame.data_len() as u8);
         for (at, &byte) in frame.data().iter().enumerate() {
             self.always[at] &= byte;
@@ -77,6 +86,11 @@ impl IdProfile {
     /// The length codes that were there, in order.
     pub fn dlcs(&self) -> Vec<u8> {
         (0..16).filter(|dlc| self.dlcs >> dlc & 1 == 1).collect()
+    }
+
+    /// The flags of FD frames that were there, in order: 1 for a switched bit rate, 2 for an error passive sender.
+    pub fn flags(&self) -> Vec<u8> {
+        (0..4).filter(|flags| self.flags >> flags & 1 == 1).collect()
     }
 
     /// A byte's bits from the highest: `0` and `1` for those that never changed, `x` for those that did; `None`
@@ -102,7 +116,8 @@ impl Profile {
     pub fn add(&mut self, record: &TraceRecord) {
         if let Some(frame) = record.frame() {
             let channel = if self.ignore_channels { 0 } else { record.channel };
-            let key = Key { channel, id: frame.id(), remote: frame.is_remote() };
+            let (remote, fd) = (frame.is_remote(), frame.is_fd());
+            let key = Key { channel, id: frame.id(), remote, fd };
             let new = IdProfile::new(record.time_ns);
             self.kinds.entry(key).or_insert(new).add(record.time_ns, frame);
         }
@@ -136,6 +151,8 @@ pub struct Changed {
     pub period_ns: Option<(f64, f64)>,
     /// Length codes, if they differ.
     pub dlcs: Option<(Vec<u8>, Vec<u8>)>,
+    /// Flags of FD frames, if they differ.
+    pub flags: Option<(Vec<u8>, Vec<u8>)>,
     /// Bytes that differ, by place.
     pub bytes: Vec<ChangedByte>,
 }
@@ -180,17 +197,14 @@ fn changed(key: Key, a: &IdProfile, b: &IdProfile, tolerance: f64) -> Option<Cha
     let period_ns =
         a.period_ns().zip(b.period_ns()).filter(|(a, b)| a.max(*b) > a.min(*b) * (1.0 + tolerance));
     let dlcs = (a.dlcs != b.dlcs).then(|| (a.dlcs(), b.dlcs()));
-    let differing = (0..8).filter_map(|byte| {
+    let flags = (a.flags != b.flags).then(|| (a.flags(), b.flags()));
+    let differing = (0..usize::from(a.len.max(b.len))).filter_map(|byte| {
         let (a, b) = (a.bits(byte).unwrap_or_default(), b.bits(byte).unwrap_or_default());
         (a != b).then_some(ChangedByte { byte, a, b })
     });
     let bytes: Vec<_> = differing.collect();
-    (period_ns.is_some() || dlcs.is_some() || !bytes.is_empty()).then_some(Changed {
-        key,
-        period_ns,
-        dlcs,
-        bytes,
-    })
+    let differs = period_ns.is_some() || dlcs.is_some() || flags.is_some() || !bytes.is_empty();
+    differs.then_some(Changed { key, period_ns, dlcs, flags, bytes })
 }
 
 #[cfg(test)]
@@ -209,7 +223,7 @@ mod tests {
     }
 
     fn key(id: &str) -> Key {
-        Key { channel: 1, id: id.parse().unwrap(), remote: false }
+        Key { channel: 1, id: id.parse().unwrap(), remote: false, fd: false }
     }
 
     #[test]
@@ -244,17 +258,37 @@ mod tests {
                     key: key("100"),
                     period_ns: Some((10e6, 20e6)),
                     dlcs: None,
+                    flags: None,
                     bytes: vec![byte(1, "00010001", "000100xx")]
                 },
                 Changed {
                     key: key("00000100"),
                     period_ns: None,
                     dlcs: Some((vec![0], vec![1])),
+                    flags: None,
                     bytes: vec![byte(0, "", "00000001")]
                 },
             ]
         );
         assert_eq!(difference.same, 1, "200's period is 10 % longer: within the tolerance");
         assert!(compare(&a, &a, 0.0).is_none());
+    }
+
+    #[test]
+    fn fd_frames_are_compared_to_their_last_byte_and_with_their_flags() {
+        let with = |flags, last| format!("100##{flags}{}{last:02X}", "00".repeat(63));
+        let fd = Key { fd: true, ..key("100") };
+        let a = profile(&[(0, &with(1, 0x10)), (10, "200##0"), (20, "300#")]);
+        let b = profile(&[(0, &with(3, 0x11)), (10, "200#"), (20, "300#")]);
+        let difference = compare(&a, &b, 0.1);
+        let byte = ChangedByte { byte: 63, a: "00010000".to_owned(), b: "00010001".to_owned() };
+        let flags = Some((vec![1], vec![3]));
+        assert_eq!(
+            difference.changed,
+            [Changed { key: fd, period_ns: None, dlcs: None, flags, bytes: vec![byte] }]
+        );
+        assert_eq!(difference.only_a, [(Key { fd: true, ..key("200") }, 1)]);
+        assert_eq!(difference.only_b, [(key("200"), 1)]);
+        assert_eq!(difference.same, 1);
     }
 }

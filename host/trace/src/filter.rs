@@ -8,9 +8,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_wire::Frame;
-
-use crate::{TraceEvent, TraceRecord};
+use crate::{TraceEvent, TraceFrame, TraceRecord};
 
 /// The flag of an extended identifier, as on Linux.
 pub const EXTENDED: u32 = 1 << 31;
@@ -81,7 +79,7 @@ impl Filter {
     }
 
     /// Whether a frame passes, on whichever channel.
-    pub fn accepts_frame(&self, frame: &Frame) -> bool {
+    pub fn accepts_frame(&self, frame: &TraceFrame) -> bool {
         if self.ids.is_empty() {
             return true;
         }

@@ -7,7 +7,11 @@
 
 pub mod align;
 pub mod diff;
+pub mod fd;
+mod fd_bits;
 pub mod filter;
+mod frame;
+mod length;
 pub mod playback;
 mod record;
 pub mod socketcan;
@@ -16,4 +20,8 @@ pub mod testing;
 
 pub use cantap_can::{Frame, FrameBits, Id, bits, bits_on_bus};
 pub use cantap_wire::Channel;
+pub use fd::FdFrame;
+pub use fd_bits::FdBits;
+pub use frame::{ParseTraceFrameError, TraceFrame};
+pub use length::BusBits;
 pub use record::{Direction, TraceEvent, TraceRecord};

@@ -1,7 +1,8 @@
 //! One entry of a trace, wherever it comes from: a live device, a file, a simulated bus.
 
-use cantap_wire::Frame;
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
+
+use crate::TraceFrame;
 
 /// Whether a frame was received or sent by the device that wrote the trace.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
@@ -31,7 +32,7 @@ pub enum TraceEvent {
     /// A frame was received or sent.
     Frame {
         /// The frame.
-        frame: Frame,
+        frame: TraceFrame,
         /// Received or sent.
         direction: Direction,
         /// Its time is only an upper bound: the frame ended then or earlier.
@@ -82,7 +83,7 @@ impl TraceEvent {
 
 impl TraceRecord {
     /// The frame, if this is one.
-    pub fn frame(&self) -> Option<&Frame> {
+    pub fn frame(&self) -> Option<&TraceFrame> {
         match &self.event {
             TraceEvent::Frame { frame, .. } => Some(frame),
             _ => None,

@@ -5,16 +5,28 @@ use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{Frame, Id};
 use proptest::prelude::*;
 
-use crate::{Direction, TraceEvent, TraceRecord};
+use crate::fd::FD_LENGTHS;
+use crate::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
-/// Any frame that a bus can carry.
-pub fn frame() -> impl Strategy<Value = Frame> {
-    let id = prop_oneof![
+fn id() -> impl Strategy<Value = Id> {
+    prop_oneof![
         (0..=Id::MAX_STANDARD).prop_map(|raw| Id::standard(raw).unwrap()),
         (0..=Id::MAX_EXTENDED).prop_map(|raw| Id::extended(raw).unwrap()),
-    ];
-    (id, any::<bool>(), 0..16_u8, any::<[u8; 8]>())
+    ]
+}
+
+/// Any frame that a classical bus can carry.
+pub fn frame() -> impl Strategy<Value = Frame> {
+    (id(), any::<bool>(), 0..16_u8, any::<[u8; 8]>())
         .prop_map(|(id, remote, dlc, data)| Frame::from_bus(id, remote, dlc, data))
+}
+
+/// Any CAN FD frame.
+pub fn fd_frame() -> impl Strategy<Value = FdFrame> {
+    let data = prop::sample::select(FD_LENGTHS.to_vec())
+        .prop_flat_map(|len| prop::collection::vec(any::<u8>(), usize::from(len)));
+    (id(), any::<bool>(), any::<bool>(), data)
+        .prop_map(|(id, brs, esi, data)| FdFrame::new(id, brs, esi, &data).unwrap())
 }
 
 /// Any event but a frame.
@@ -58,9 +70,24 @@ pub fn data_record(time_ns: i64) -> TraceRecord {
     TraceRecord { time_ns, channel: 1, event }
 }
 
-/// Any record whose time is a multiple of `resolution_ns`, from 1937 to 2096.
+/// Any record of a classical bus whose time is a multiple of `resolution_ns`, from 1937 to 2096.
 pub fn record(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
-    let frame = (frame(), prop::sample::select(vec![Direction::Rx, Direction::Tx]))
+    record_of(frame().prop_map(TraceFrame::from), resolution_ns)
+}
+
+/// As [`record`], FD frames among them.
+pub fn record_or_fd(resolution_ns: i64) -> impl Strategy<Value = TraceRecord> {
+    record_of(
+        prop_oneof![frame().prop_map(TraceFrame::from), fd_frame().prop_map(TraceFrame::from)],
+        resolution_ns,
+    )
+}
+
+fn record_of(
+    frame: impl Strategy<Value = TraceFrame>,
+    resolution_ns: i64,
+) -> impl Strategy<Value = TraceRecord> {
+    let frame = (frame, prop::sample::select(vec![Direction::Rx, Direction::Tx]))
         .prop_map(|(frame, direction)| TraceEvent::Frame { frame, direction, late: false });
     let second = 1_000_000_000_i64;
     let time = -second * second..4 * second * second;

@@ -25,7 +25,7 @@ impl SequenceCheck {
         match record.event {
             TraceEvent::Frame { frame, .. } => {
                 self.delivered += 1;
-                self.in_order &= self.source.next() == Some(frame);
+                self.in_order &= self.source.next().is_some_and(|expected| frame == expected);
             }
             TraceEvent::Lost { count, at_least, .. } => {
                 self.lost += u64::from(count);
@@ -80,7 +80,8 @@ mod tests {
                 }
             }
             let Some(index) = take(index) else { continue };
-            let event = TraceEvent::Frame { frame: frames[index], direction: Direction::Rx, late: false };
+            let event =
+                TraceEvent::Frame { frame: frames[index].into(), direction: Direction::Rx, late: false };
             check.push(&TraceRecord { time_ns: 0, channel: 1, event });
         }
         check

@@ -6,7 +6,7 @@ use cantap_wire::{CHANNELS, Frame};
 
 use super::options::{BadOption, Options};
 use cantap_formats::{ReadOptions, open_reader};
-use cantap_trace::TraceEvent;
+use cantap_trace::{TraceEvent, TraceFrame};
 
 impl Options {
     /// Replays a trace file at its own times in place of made-up frames: channel 1 of the file on the first
@@ -23,7 +23,7 @@ impl Options {
         let mut start_ns = None;
         for record in reader {
             let record = record.map_err(|issue| bad(issue.to_string()))?;
-            let TraceEvent::Frame { frame, .. } = record.event else { continue };
+            let TraceEvent::Frame { frame: TraceFrame::Classic(frame), .. } = record.event else { continue };
             let start_ns = *start_ns.get_or_insert(record.time_ns);
             if let Some(entries) = log.get_mut(usize::from(record.channel.saturating_sub(1))) {
                 let at_ns = u64::try_from(record.time_ns.saturating_sub(start_ns)).unwrap_or(0);

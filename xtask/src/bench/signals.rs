@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, ensure};
-use cantap::Frame;
+use cantap::{Frame, TraceFrame};
 use cantap_signals::{Decoder, Source, dbc};
 use xshell::cmd;
 
@@ -27,7 +27,7 @@ pub fn run() -> Result<()> {
     let shell = workspace::shell()?;
     let bytes = shell.read_binary_file(DATABASE)?;
     let database = dbc::parse(DATABASE, &bytes)?;
-    let frames: Vec<Frame> = database.messages.iter().flat_map(frames_of).collect();
+    let frames: Vec<TraceFrame> = database.messages.iter().flat_map(frames_of).collect();
     let decoder = Decoder::new(vec![Source { channel: None, database }]);
 
     let (signals, seconds) = ours(&decoder, &frames);
@@ -65,19 +65,19 @@ pub fn run() -> Result<()> {
 }
 
 /// Random payloads that every program makes the same way.
-fn frames_of(message: &cantap_signals::Message) -> Vec<Frame> {
+fn frames_of(message: &cantap_signals::Message) -> Vec<TraceFrame> {
     let payload = |number: u64| {
         let mut random = (u64::from(message.id.raw()) << 32 | number).wrapping_mul(0x9E37_79B9_7F4A_7C15);
         random ^= random >> 29;
         random = random.wrapping_mul(0xBF58_476D_1CE4_E5B9);
         let bytes = (random ^ random >> 32).to_le_bytes();
-        Frame::from_bus(message.id, false, message.length.min(8) as u8, bytes)
+        Frame::from_bus(message.id, false, message.length.min(8) as u8, bytes).into()
     };
     (0..PAYLOADS).map(payload).collect()
 }
 
 /// Decodes all frames until [`DURATION`] is over: signals in all and per round, and seconds.
-fn ours(decoder: &Decoder, frames: &[Frame]) -> ((u64, u64), f64) {
+fn ours(decoder: &Decoder, frames: &[TraceFrame]) -> ((u64, u64), f64) {
     let mut values = Vec::new();
     let (mut signals, mut rounds) = (0, 0);
     let begin = Instant::now();

@@ -44,7 +44,7 @@ fn records(ids: u32) -> Vec<TraceRecord> {
             let random = (n + 1).wrapping_mul(6_364_136_223_846_793_005).rotate_left(32);
             let id = Id::extended_truncated((random % u64::from(ids)) as u32 * 8191);
             let frame = Frame::from_bus(id, false, 8, random.to_be_bytes());
-            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
             TraceRecord { time_ns: n as i64 * 70_000, channel: 1 + (n % 2) as u8, event }
         })
         .collect()

@@ -1,12 +1,12 @@
 //! A decoded frame, and how its time is written.
 
-use cantap::{Frame, TraceRecord};
+use cantap::{TraceFrame, TraceRecord};
 use cantap_signals::{Message, SignalValue};
 
 /// A decoded frame, as the three outputs take it.
 pub struct Decoded<'a> {
     pub record: &'a TraceRecord,
-    pub frame: &'a Frame,
+    pub frame: &'a TraceFrame,
     pub message: &'a Message,
     pub values: &'a [SignalValue],
 }

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use anyhow::bail;
 use cantap::device::Records;
 use cantap::transmit::Stream;
-use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceRecord, bits_on_bus};
+use cantap::{Channel, Device, Direction, Frame, Id, TraceEvent, TraceFrame, TraceRecord, bits_on_bus};
 use serde_json::{Value, json};
 
 use crate::interrupt;
@@ -238,7 +238,9 @@ fn hear(record: &TraceRecord, flows: &mut [Flow]) {
     let on = |flow: &&mut Flow| flow.to.number() == record.channel;
     let Some(flow) = flows.iter_mut().find(on) else { return };
     match &record.event {
-        TraceEvent::Frame { frame, direction: Direction::Rx, .. } => flow.hear(frame),
+        TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction: Direction::Rx, .. } => {
+            flow.hear(frame);
+        }
         TraceEvent::BusError { .. } => flow.bus_errors += 1,
         TraceEvent::ErrorsSuppressed { count } => flow.bus_errors += count,
         _ => {}

@@ -35,7 +35,10 @@ pub(super) fn hint(summary: &Summary, per_id: bool) -> &'static str {
 
 fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     let _ = match channel.bitrate {
-        Some(bitrate) => writeln!(out, "\nChannel {} at {bitrate} bit/s", channel.channel),
+        Some(bitrate) => {
+            let data = channel.data_bitrate.map_or(String::new(), |data| format!(", data at {data} bit/s"));
+            writeln!(out, "\nChannel {} at {bitrate} bit/s{data}", channel.channel)
+        }
         None => {
             writeln!(out, "\nChannel {}, bit rate unknown: give it with -b for the load", channel.channel)
         }
@@ -50,11 +53,24 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
         channel.sent,
         channel.frames_per_s,
     );
+    if channel.fd > 0 {
+        let _ = writeln!(
+            out,
+            "  CAN FD    {} frames ({} with a switched bit rate, {} of an error passive sender)",
+            channel.fd, channel.brs, channel.esi,
+        );
+    }
     let _ = writeln!(
         out,
         "  bits      {} with stuff bits and intermission, {:.0} bit/s",
         channel.bits, channel.bits_per_s
     );
+    if channel.bitrate.is_some() && channel.brs > 0 && channel.data_bitrate.is_none() {
+        let _ = writeln!(
+            out,
+            "  load      unknown: frames switch to a data bit rate, which --data-bitrate gives (such as 2M)",
+        );
+    }
     if let Some(load) = &channel.load {
         let percent = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3} %"));
         let bound =

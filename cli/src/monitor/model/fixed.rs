@@ -2,7 +2,9 @@
 
 use std::collections::HashMap;
 
-use cantap::{Direction, Frame, Id, TraceEvent, TraceRecord};
+use cantap_trace::fd::FD_MAX_BYTES;
+
+use cantap::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
 
 /// Rows there may be; the frames of further identifiers are counted together.
 const MOST_ROWS: usize = 8192;
@@ -15,7 +17,7 @@ pub struct Row {
     /// The channel, from 1.
     pub channel: u8,
     /// Its last frame.
-    pub frame: Frame,
+    pub frame: TraceFrame,
     /// Whether that was sent by us.
     pub direction: Direction,
     /// Frames so far.
@@ -26,14 +28,12 @@ pub struct Row {
     pub period_ns: Option<f64>,
     /// How far intervals are from that, smoothed, in nanoseconds.
     pub jitter_ns: f64,
-    /// Bits in which the last frame differs from the one before; the first byte is on top.
-    pub changed: u64,
     /// When each hexadecimal digit last changed; the first byte's upper one is the first.
-    pub changed_ns: [i64; 16],
+    pub changed_ns: Box<[i64; 2 * FD_MAX_BYTES]>,
     /// How often each bit changed; the first byte's highest bit is the first.
-    pub heat: Box<[u32; 64]>,
-    /// Bits whose changes are not shown.
-    pub notched: u64,
+    pub heat: Box<[u32; 8 * FD_MAX_BYTES]>,
+    /// Bits whose changes are not shown, by byte.
+    pub notched: [u8; FD_MAX_BYTES],
     /// Not to be shown.
     pub hidden: bool,
     /// Number of the colour it is marked with; 0 is none.
@@ -43,7 +43,7 @@ pub struct Row {
 }
 
 impl Row {
-    fn new(record: &TraceRecord, frame: Frame, direction: Direction) -> Self {
+    fn new(record: &TraceRecord, frame: TraceFrame, direction: Direction) -> Self {
         Self {
             channel: record.channel,
             frame,
@@ -52,17 +52,16 @@ impl Row {
             last_ns: record.time_ns,
             period_ns: None,
             jitter_ns: 0.0,
-            changed: 0,
-            changed_ns: [i64::MIN; 16],
-            heat: Box::new([0; 64]),
-            notched: 0,
+            changed_ns: Box::new([i64::MIN; 2 * FD_MAX_BYTES]),
+            heat: Box::new([0; 8 * FD_MAX_BYTES]),
+            notched: [0; FD_MAX_BYTES],
             hidden: false,
             mark: 0,
             gap: false,
         }
     }
 
-    fn take(&mut self, time_ns: i64, frame: Frame, direction: Direction) {
+    fn take(&mut self, time_ns: i64, frame: TraceFrame, direction: Direction) {
         // A clock that was set back, as where a file begins anew, says nothing either.
         if self.count > 0 && !self.gap && time_ns >= self.last_ns {
             let interval = time_ns.saturating_sub(self.last_ns) as f64;
@@ -76,17 +75,9 @@ impl Row {
             }
         }
         if self.count > 0 {
-            self.changed =
-                u64::from_be_bytes(self.frame.padded_data()) ^ u64::from_be_bytes(frame.padded_data());
-            let mut bits = self.changed;
-            while bits != 0 {
-                let bit = bits.leading_zeros() as usize;
-                self.heat[bit] = self.heat[bit].saturating_add(1);
-                // What is notched is not worth a glance.
-                if self.notched >> (63 - bit) & 1 == 0 {
-                    self.changed_ns[bit / 4] = time_ns;
-                }
-                bits &= !(1 << (63 - bit));
+            for at in 0..self.frame.data_len().max(frame.data_len()) {
+                let byte = |frame: &TraceFrame| frame.data().get(at).copied().unwrap_or(0);
+                self.byte_changed(at, byte(&self.frame) ^ byte(&frame), time_ns);
             }
         }
         self.count += 1;
@@ -94,6 +85,20 @@ impl Row {
         self.last_ns = time_ns;
         self.frame = frame;
         self.direction = direction;
+    }
+
+    /// Of the byte at `at`, these bits changed.
+    fn byte_changed(&mut self, at: usize, mut bits: u8, time_ns: i64) {
+        while bits != 0 {
+            let bit = bits.leading_zeros() as usize;
+            let place = 8 * at + bit;
+            self.heat[place] = self.heat[place].saturating_add(1);
+            // What is notched is not worth a glance.
+            if self.notched[at] >> (7 - bit) & 1 == 0 {
+                self.changed_ns[place / 4] = time_ns;
+            }
+            bits &= !(1 << (7 - bit));
+        }
     }
 
     /// Its last frame as a record.
@@ -104,10 +109,10 @@ impl Row {
 
     /// Hides changes of all bits that changed so far.
     fn notch(&mut self) {
-        self.changed_ns = [i64::MIN; 16];
+        self.changed_ns.fill(i64::MIN);
         for (bit, count) in self.heat.iter().enumerate() {
             if *count > 0 {
-                self.notched |= 1 << (63 - bit);
+                self.notched[bit / 8] |= 1 << (7 - bit % 8);
             }
         }
     }
@@ -172,7 +177,7 @@ impl FixedTable {
 
     /// Shows all changes again.
     pub fn unnotch(&mut self) {
-        self.rows.iter_mut().for_each(|row| row.notched = 0);
+        self.rows.iter_mut().for_each(|row| row.notched = [0; FD_MAX_BYTES]);
     }
 
     /// Shows all rows again.
@@ -192,13 +197,23 @@ mod tests {
     }
 
     #[test]
+    fn the_last_byte_of_an_fd_frame_is_watched_too() {
+        let mut table = FixedTable::default();
+        for (time, last) in [(0, "10"), (10, "11")] {
+            take(&mut table, time, &format!("123##1{}{last}", "00".repeat(63)));
+        }
+        assert_eq!(table.rows()[0].heat[511], 1);
+        assert_eq!(table.rows()[0].changed_ns[127], 10_000_000);
+    }
+
+    #[test]
     fn changed_bits_are_found_counted_and_can_be_notched() {
         let mut table = FixedTable::default();
         for (time, text) in [(0, "123#0011"), (10, "123#0110"), (20, "123#0110")] {
             take(&mut table, time, text);
         }
         let row = &table.rows()[0];
-        assert_eq!((row.count, row.changed), (3, 0));
+        assert_eq!(row.count, 3);
         assert_eq!((row.heat[7], row.heat[15]), (1, 1));
         let ns = |ms: i64| if ms < 0 { i64::MIN } else { ms * 1_000_000 };
         // Digit by digit: 00 11, then 01 10.

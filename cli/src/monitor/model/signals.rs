@@ -3,7 +3,7 @@
 use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
-use cantap::{Direction, Frame, TraceEvent, TraceRecord};
+use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_signals::{Alarm, Decoder, MessageRef, Signal, SignalValue};
 
 /// Signals with a row; more than any screen shows.
@@ -38,7 +38,7 @@ pub struct SignalRow {
     /// Its index in the message.
     pub signal: u32,
     /// The frame that had the last value.
-    pub frame: Frame,
+    pub frame: TraceFrame,
     /// The last value's bits.
     pub raw: u64,
     /// The last value.
@@ -96,7 +96,7 @@ impl SignalTable {
         self.values = values;
     }
 
-    fn value(&mut self, record: &TraceRecord, frame: Frame, message: MessageRef, value: &SignalValue) {
+    fn value(&mut self, record: &TraceRecord, frame: TraceFrame, message: MessageRef, value: &SignalValue) {
         let key = (record.channel, message, value.signal);
         let place = match self.places.get(&key) {
             Some(place) => *place,

@@ -103,7 +103,7 @@ fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
         }
         spans.push(Span::raw(" "));
     }
-    let room = 3 * (8 - data.len());
+    let room = 3 * 8_usize.saturating_sub(data.len());
     let characters = if ascii { format!("{:<8} ", printable(data)) } else { String::new() };
     spans.push(Span::raw(format!("{:room$}{characters}", "")));
     spans.push(Span::styled(name(row, seen).to_owned(), base));

@@ -5,8 +5,7 @@ use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use super::ids::{IdStatistics, Ids};
 use super::windows::{Window, Windows, per_second};
 use super::work_load::WorkLoad;
-use cantap_trace::bits::bits_on_bus;
-use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
 
 /// Statistics of one channel.
 #[derive(Clone, Debug)]
@@ -15,6 +14,8 @@ pub struct ChannelStatistics {
     pub number: u8,
     /// Its bit rate in bit/s, if known.
     pub bitrate_bps: Option<u32>,
+    /// The bit rate of its data phases in bit/s, if known.
+    pub data_bitrate_bps: Option<u32>,
     /// Frames, sent and received.
     pub frames: u64,
     /// Those that the device sent.
@@ -23,6 +24,12 @@ pub struct ChannelStatistics {
     pub extended: u64,
     /// Remote frames.
     pub remote: u64,
+    /// CAN FD frames.
+    pub fd: u64,
+    /// CAN FD frames with a bit rate of its own in the data phase.
+    pub brs: u64,
+    /// CAN FD frames of an error passive sender.
+    pub esi: u64,
     /// Frames whose time is only an upper bound.
     pub late: u64,
     /// Bits of all frames, with stuff bits and intermission.
@@ -33,7 +40,7 @@ pub struct ChannelStatistics {
     pub span_ns: Option<(i64, i64)>,
     /// Records whose time lies before that of the record before.
     pub out_of_order: u64,
-    /// Work load; `None` without a bit rate.
+    /// Work load; `None` without a bit rate, or where that of a frame's data phase is not known.
     pub load: Option<WorkLoad>,
     /// Errors on the bus.
     pub errors: Errors,
@@ -109,6 +116,7 @@ impl ChannelStatistics {
     pub(super) fn new(
         number: u8,
         bitrate_bps: Option<u32>,
+        data_bitrate_bps: Option<u32>,
         has_load: bool,
         origin_ns: i64,
         window_ns: u64,
@@ -118,10 +126,14 @@ impl ChannelStatistics {
         Self {
             number,
             bitrate_bps,
+            data_bitrate_bps,
             frames: 0,
             sent: 0,
             extended: 0,
             remote: 0,
+            fd: 0,
+            brs: 0,
+            esi: 0,
             late: 0,
             bits: 0,
             data_bytes: 0,
@@ -134,7 +146,7 @@ impl ChannelStatistics {
             state_changes: 0,
             counters: None,
             transmit_failures: 0,
-            windows: Windows::new(number, origin_ns, window_ns, load_of_bps, peaks),
+            windows: Windows::new(number, origin_ns, window_ns, load_of_bps, data_bitrate_bps, peaks),
             ids: Ids::default(),
             latest_ns: i64::MIN,
             gaps: 0,
@@ -200,13 +212,17 @@ impl ChannelStatistics {
     #[inline]
     fn frame(
         &mut self,
-        frame: &Frame,
+        frame: &TraceFrame,
         direction: Direction,
         late: bool,
         end_ns: i64,
         closed: &mut impl FnMut(&Window),
     ) {
-        let bits = bits_on_bus(frame);
+        let on_bus = frame.bus_bits();
+        if frame.is_fd() {
+            self.fd_frame(frame, on_bus.data > 0);
+        }
+        let bits = on_bus.total();
         self.frames += 1;
         self.bits += u64::from(bits);
         self.data_bytes += frame.data_len() as u64;
@@ -223,10 +239,28 @@ impl ChannelStatistics {
         self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
         self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
         if let Some(load) = &mut self.load {
-            load.frame(end_ns, bits);
+            // Without its rate the data phase has no bits here: see `fd_frame`.
+            let data = match (self.bitrate_bps, self.data_bitrate_bps) {
+                (Some(nominal), Some(data)) if on_bus.data > 0 => {
+                    f64::from(on_bus.data) * f64::from(nominal) / f64::from(data)
+                }
+                _ => 0.0,
+            };
+            load.frame(end_ns, f64::from(on_bus.nominal) + data);
         }
-        self.windows.frame(end_ns, bits, closed);
+        self.windows.frame(end_ns, on_bus, closed);
         self.ids.add(frame, direction, bits, end_ns, self.gaps);
+    }
+
+    #[cold]
+    fn fd_frame(&mut self, frame: &TraceFrame, is_switched: bool) {
+        self.fd += 1;
+        self.brs += u64::from(is_switched);
+        self.esi += u64::from(frame.fd().is_some_and(cantap_trace::FdFrame::esi));
+        // How long a data phase takes that has a rate of its own, nobody can tell without that rate.
+        if is_switched && self.data_bitrate_bps.is_none() && self.load.take().is_some() {
+            self.windows.forget_load();
+        }
     }
 
     /// The interval from the last frame to the next one says nothing.

@@ -3,7 +3,7 @@
 use std::collections::HashMap;
 use std::hash::{BuildHasherDefault, Hasher};
 
-use cantap_trace::{Direction, Frame, Id};
+use cantap_trace::{Direction, Id, TraceFrame};
 
 /// Identifiers that are followed one by one on each channel. Random or hostile traffic may have half a
 /// billion; the frames of those beyond this number are counted together.
@@ -97,7 +97,7 @@ pub struct IdStatistics {
 }
 
 impl IdStatistics {
-    fn new(frame: &Frame, end_ns: i64, generation: u32) -> Self {
+    fn new(frame: &TraceFrame, end_ns: i64, generation: u32) -> Self {
         Self {
             id: frame.id(),
             frames: 0,
@@ -115,7 +115,7 @@ impl IdStatistics {
     }
 
     #[inline]
-    fn add(&mut self, frame: &Frame, direction: Direction, bits: u32, end_ns: i64, generation: u32) {
+    fn add(&mut self, frame: &TraceFrame, direction: Direction, bits: u32, end_ns: i64, generation: u32) {
         if self.frames > 0 && self.generation == generation {
             let interval = end_ns.saturating_sub(self.last_ns);
             if interval >= 0 {
@@ -153,7 +153,7 @@ impl Ids {
     #[inline]
     pub(super) fn add(
         &mut self,
-        frame: &Frame,
+        frame: &TraceFrame,
         direction: Direction,
         bits: u32,
         end_ns: i64,
@@ -217,7 +217,7 @@ mod tests {
     use super::*;
 
     fn add(ids: &mut Ids, text: &str, end_ns: i64, generation: u32) {
-        let frame: Frame = text.parse().unwrap();
+        let frame: TraceFrame = text.parse().unwrap();
         ids.add(&frame, Direction::Rx, 50, end_ns, generation);
     }
 
@@ -274,7 +274,7 @@ mod tests {
     fn more_identifiers_than_there_is_room_for_are_counted_together() {
         let mut ids = Ids::default();
         for raw in 0..MOST_IDS as u32 + 10 {
-            let frame = Frame::data_frame(Id::extended_truncated(raw), &[]).unwrap();
+            let frame = cantap_trace::Frame::data_frame(Id::extended_truncated(raw), &[]).unwrap().into();
             ids.add(&frame, Direction::Rx, 50, 0, 0);
         }
         assert_eq!((ids.len(), ids.unlisted_frames), (MOST_IDS, 10));

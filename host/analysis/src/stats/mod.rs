@@ -13,7 +13,6 @@ mod work_load;
 use std::time::Duration;
 
 use cantap_trace::TraceRecord;
-use cantap_trace::bits::bits_on_bus;
 
 pub use channel::{ChannelStatistics, Errors, Losses};
 pub use ids::{IdStatistics, MOST_IDS, Period};
@@ -28,6 +27,10 @@ pub struct Options {
     pub bitrate_bps: Option<u32>,
     /// Bit rates of single channels: channel from 1, bit/s.
     pub channel_bitrate_bps: Vec<(u8, u32)>,
+    /// Bit rate of the data phases of CAN FD frames, of the channels that [`Self::channel_data_bitrate_bps`] does not name.
+    pub data_bitrate_bps: Option<u32>,
+    /// The same of single channels: channel from 1, bit/s.
+    pub channel_data_bitrate_bps: Vec<(u8, u32)>,
     /// Channels, from 1, whose frames came without their data or times: they have no load, whatever their bit rate.
     pub without_load: Vec<u8>,
     /// Length of a window.
@@ -42,6 +45,8 @@ impl Default for Options {
         Self {
             bitrate_bps: None,
             channel_bitrate_bps: Vec::new(),
+            data_bitrate_bps: None,
+            channel_data_bitrate_bps: Vec::new(),
             without_load: Vec::new(),
             window: SECOND,
             peaks: 5,
@@ -52,9 +57,18 @@ impl Default for Options {
 impl Options {
     /// The bit rate of a channel, if known.
     pub fn bitrate_of(&self, channel: u8) -> Option<u32> {
-        let own = self.channel_bitrate_bps.iter().find(|(number, _)| *number == channel);
-        own.map(|(_, bitrate)| *bitrate).or(self.bitrate_bps)
+        of_channel(&self.channel_bitrate_bps, channel).or(self.bitrate_bps)
     }
+
+    /// The bit rate of a channel's data phases, if known.
+    pub fn data_bitrate_of(&self, channel: u8) -> Option<u32> {
+        of_channel(&self.channel_data_bitrate_bps, channel).or(self.data_bitrate_bps)
+    }
+}
+
+/// A channel's own bit rate.
+fn of_channel(rates: &[(u8, u32)], channel: u8) -> Option<u32> {
+    rates.iter().find(|(number, _)| *number == channel).map(|(_, bitrate)| *bitrate)
 }
 
 /// Why there can be no statistics with these options.
@@ -101,16 +115,25 @@ impl Statistics {
         let rates =
             options.channel_bitrate_bps.iter().map(|(_, bitrate)| *bitrate).chain(options.bitrate_bps);
         let slowest = rates.min();
+        let mut data_rates = options
+            .channel_data_bitrate_bps
+            .iter()
+            .map(|(_, bitrate)| *bitrate)
+            .chain(options.data_bitrate_bps);
+        let fastest_data = data_rates.clone().max();
         let window_ns = match u64::try_from(options.window.as_nanos()) {
             Ok(window_ns) if options.window <= YEAR => window_ns,
             _ => return Err(BadOptions::WindowTooLong),
         };
-        if slowest == Some(0) {
+        if slowest == Some(0) || data_rates.any(|bitrate| bitrate == 0) {
             return Err(BadOptions::ZeroBitrate);
         }
         // Without any bit rate a window needs to be no longer than the fastest bus asks for.
         let bitrate_bps = slowest.unwrap_or(cantap_wire::timing::MAX_BITRATE_BPS);
-        let shortest_ns = shortest_window_ns(bitrate_bps);
+        let shortest_ns = match fastest_data {
+            Some(_) => windows::shortest_fd_window_ns(bitrate_bps),
+            None => shortest_window_ns(bitrate_bps),
+        };
         if window_ns < shortest_ns {
             return Err(BadOptions::WindowTooShort { bitrate_bps, shortest_us: shortest_ns.div_ceil(1000) });
         }
@@ -146,14 +169,19 @@ impl Statistics {
         // Windows begin where the trace's first frame begins, on all channels alike.
         let origin_ns = *self.first_ns.get_or_insert_with(|| match (record.frame(), bitrate) {
             (Some(frame), Some(bitrate)) => {
-                let bits = bits_on_bus(frame) - cantap_trace::bits::INTERMISSION_BITS;
-                record.time_ns.saturating_sub(windows::bits_to_ns(u64::from(bits), bitrate) as i64)
+                let bits = frame.bus_bits();
+                let nominal = u64::from(bits.nominal - cantap_trace::bits::INTERMISSION_BITS);
+                let data = self.options.data_bitrate_of(record.channel).unwrap_or(bitrate);
+                let ns =
+                    windows::bits_to_ns(nominal, bitrate) + windows::bits_to_ns(u64::from(bits.data), data);
+                record.time_ns.saturating_sub(ns as i64)
             }
             _ => record.time_ns,
         });
         self.channels.push(ChannelStatistics::new(
             record.channel,
             bitrate,
+            self.options.data_bitrate_of(record.channel),
             !self.options.without_load.contains(&record.channel),
             origin_ns,
             self.window_ns,

@@ -33,6 +33,8 @@ pub struct ChannelSummary {
     pub channel: u8,
     /// Its bit rate in bit/s, if it was given.
     pub bitrate: Option<u32>,
+    /// The bit rate of its data phases in bit/s, if it was given.
+    pub data_bitrate: Option<u32>,
     /// Frames, sent and received.
     pub frames: u64,
     /// Those that were sent by the device.
@@ -43,6 +45,12 @@ pub struct ChannelSummary {
     pub extended: u64,
     /// Remote frames.
     pub remote: u64,
+    /// CAN FD frames.
+    pub fd: u64,
+    /// CAN FD frames with a bit rate of its own in the data phase.
+    pub brs: u64,
+    /// CAN FD frames of an error passive sender.
+    pub esi: u64,
     /// Frames whose time is only an upper bound.
     pub late: u64,
     /// Records that are older than the record before.
@@ -237,11 +245,15 @@ impl ChannelSummary {
         Self {
             channel: channel.number,
             bitrate: channel.bitrate_bps,
+            data_bitrate: channel.data_bitrate_bps,
             frames: channel.frames,
             sent: channel.sent,
             standard: channel.frames - channel.extended,
             extended: channel.extended,
             remote: channel.remote,
+            fd: channel.fd,
+            brs: channel.brs,
+            esi: channel.esi,
             late: channel.late,
             out_of_order: channel.out_of_order,
             first_s: channel.span_ns.map(|(first, _)| seconds(first)),

@@ -5,6 +5,7 @@
 
 use std::collections::VecDeque;
 
+use cantap_trace::BusBits;
 use cantap_trace::bits::INTERMISSION_BITS;
 
 /// Bits that an error frame takes at least: a flag of six, a delimiter of eight, and the intermission. The
@@ -14,6 +15,10 @@ pub const ERROR_FRAME_BITS: u32 = 6 + 8 + INTERMISSION_BITS;
 
 /// Bits of the longest classical frame, all stuff bits included, with its intermission.
 const LONGEST_FRAME_BITS: u64 = 160;
+
+/// Bits of the longest CAN FD frame, all of them at the nominal rate: 41 of its head, 64 bytes, a stuff bit after every four of
+/// these, 4 of the stuff count, 21 of the CRC, 7 at fixed places, delimiter, end and intermission.
+const LONGEST_FD_FRAME_BITS: u64 = (41 + 512) * 5 / 4 + 4 + 21 + 7 + 1 + 9 + 3;
 
 /// Nanoseconds that `bits` take, rounded to the nearest.
 pub(super) fn bits_to_ns(bits: u64, bitrate_bps: u32) -> u64 {
@@ -25,6 +30,11 @@ pub(super) fn bits_to_ns(bits: u64, bitrate_bps: u32) -> u64 {
 /// The shortest window that a frame cannot outlast at this bit rate, in nanoseconds.
 pub fn shortest_window_ns(bitrate_bps: u32) -> u64 {
     bits_to_ns(LONGEST_FRAME_BITS, bitrate_bps.max(1))
+}
+
+/// As [`shortest_window_ns`], where there may be CAN FD frames.
+pub(super) fn shortest_fd_window_ns(bitrate_bps: u32) -> u64 {
+    bits_to_ns(LONGEST_FD_FRAME_BITS, bitrate_bps.max(1))
 }
 
 /// One window of time on one channel.
@@ -93,6 +103,7 @@ pub(super) fn per_second(count: u64, length_ns: u64) -> f64 {
 pub(super) struct Windows {
     length_ns: u64,
     bitrate_bps: Option<u32>,
+    data_bitrate_bps: Option<u32>,
     current: Window,
     /// What of a frame's intermission reaches into the next window.
     carry_ns: u64,
@@ -115,11 +126,13 @@ impl Windows {
         origin_ns: i64,
         length_ns: u64,
         bitrate_bps: Option<u32>,
+        data_bitrate_bps: Option<u32>,
         peaks: usize,
     ) -> Self {
         Self {
             length_ns,
             bitrate_bps,
+            data_bitrate_bps,
             current: Window::new(channel, origin_ns, length_ns),
             carry_ns: 0,
             pending: None,
@@ -130,6 +143,15 @@ impl Windows {
             load_sum: 0.0,
             suspended: false,
         }
+    }
+
+    /// How long frames take is not known after all: there is no load, neither of this window nor of those before.
+    pub(super) fn forget_load(&mut self) {
+        self.bitrate_bps = None;
+        let forget = |window: &mut Window| (window.load_pct, window.busy_ns) = (None, 0);
+        self.pending.iter_mut().chain(&mut self.peaks.best).for_each(forget);
+        self.current.busy_ns = 0;
+        self.carry_ns = 0;
     }
 
     /// From here to the next record nothing is known: the window that runs says nothing, and those until then are none.
@@ -202,17 +224,21 @@ impl Windows {
 
     /// A frame of `bits` that ended at `end_ns`. [`Self::advance`] to `end_ns` comes first.
     #[inline]
-    pub(super) fn frame(&mut self, end_ns: i64, bits: u32, closed: &mut impl FnMut(&Window)) {
+    pub(super) fn frame(&mut self, end_ns: i64, bits: BusBits, closed: &mut impl FnMut(&Window)) {
         self.in_gap = false;
         self.current.frames += 1;
-        self.current.bits += u64::from(bits);
+        self.current.bits += u64::from(bits.total());
         let Some(bitrate) = self.bitrate_bps else {
             return self.close_pending(closed);
         };
         // Relative to the window's start, so that no file's times overflow.
         let end = end_ns.saturating_sub(self.current.start_ns).clamp(-1, self.length_ns as i64);
-        let start = end - bits_to_ns(u64::from(bits - INTERMISSION_BITS), bitrate) as i64;
-        let stop = start + bits_to_ns(u64::from(bits), bitrate) as i64;
+        let data_ns = match self.data_bitrate_bps {
+            Some(data_bitrate) if bits.data > 0 => bits_to_ns(u64::from(bits.data), data_bitrate) as i64,
+            _ => 0,
+        };
+        let start = end - bits_to_ns(u64::from(bits.nominal - INTERMISSION_BITS), bitrate) as i64 - data_ns;
+        let stop = start + bits_to_ns(u64::from(bits.nominal), bitrate) as i64 + data_ns;
         // A stamp from the past (traces that are merged badly) counts whole where it arrives.
         let before = if end < 0 { 0 } else { (-start).max(0) };
         let after = (stop - self.length_ns as i64).max(0);
@@ -353,20 +379,24 @@ impl Peaks {
 mod tests {
     use super::*;
 
+    fn classic(nominal: u32) -> BusBits {
+        BusBits { nominal, data: 0 }
+    }
+
     #[test]
     fn windows_between_the_last_frame_and_a_loss_record_are_incomplete_and_count_for_no_mean() {
         let mut windows = windows(1_000_000);
         let mut seen = Vec::new();
         for end in [500_000, 1_500_000, 2_500_000] {
             windows.advance(end, &mut |window| seen.push(*window));
-            windows.frame(end, 100, &mut |window| seen.push(*window));
+            windows.frame(end, classic(100), &mut |window| seen.push(*window));
         }
         windows.gap();
         windows.advance(5_500_000, &mut |window| seen.push(*window));
         windows.lost(7);
         for end in [5_500_000, 6_500_000] {
             windows.advance(end, &mut |window| seen.push(*window));
-            windows.frame(end, 100, &mut |window| seen.push(*window));
+            windows.frame(end, classic(100), &mut |window| seen.push(*window));
         }
         windows.finish(8_000_000, &mut |window| seen.push(*window));
         let incomplete: Vec<_> = seen.iter().map(|window| window.incomplete).collect();
@@ -378,7 +408,7 @@ mod tests {
     }
 
     fn windows(bitrate_bps: u32) -> Windows {
-        Windows::new(1, 0, 1_000_000, Some(bitrate_bps), 3)
+        Windows::new(1, 0, 1_000_000, Some(bitrate_bps), None, 3)
     }
 
     #[test]
@@ -387,7 +417,7 @@ mod tests {
         let mut seen = Vec::new();
         // 103 bits: 30 µs of it before the border, 70 behind, and 3 of intermission.
         windows.advance(1_070_000, &mut |window| seen.push(*window));
-        windows.frame(1_070_000, 103, &mut |window| seen.push(*window));
+        windows.frame(1_070_000, classic(103), &mut |window| seen.push(*window));
         windows.finish(2_000_000, &mut |window| seen.push(*window));
         let loads: Vec<_> = seen.iter().map(|window| window.load_pct.unwrap()).collect();
         assert_eq!(loads, [3.0, 7.3]);
@@ -402,7 +432,7 @@ mod tests {
         for n in 1..=1000 {
             let end = n * 58_000 - 3_000;
             windows.advance(end, &mut |window| loads.push(window.load_pct.unwrap()));
-            windows.frame(end, 58, &mut |window| loads.push(window.load_pct.unwrap()));
+            windows.frame(end, classic(58), &mut |window| loads.push(window.load_pct.unwrap()));
         }
         assert_eq!(loads.len(), 57);
         assert!(loads.iter().all(|load| (load - 100.0).abs() < 1e-9), "{loads:?}");
@@ -422,9 +452,9 @@ mod tests {
         let mut windows = windows(1_000_000);
         let year = 365 * 86_400 * 1_000_000_000;
         let mut count = 0u64;
-        windows.frame(500_000, 58, &mut |_| count += 1);
+        windows.frame(500_000, classic(58), &mut |_| count += 1);
         windows.advance(year + 250_000, &mut |_| count += 1);
-        windows.frame(year + 250_000, 58, &mut |_| count += 1);
+        windows.frame(year + 250_000, classic(58), &mut |_| count += 1);
         let running = windows.running(year + 300_000);
         assert_eq!((running.start_ns, running.frames), (year, 1));
         assert!(count < 200_000, "{count}");
@@ -440,7 +470,7 @@ mod tests {
         let mut seen = Vec::new();
         for end in [9_500_000, 2_250_000, 3_250_000, 4_300_000] {
             windows.advance(end, &mut |window| seen.push((window.start_ns, window.frames)));
-            windows.frame(end, 58, &mut |window| seen.push((window.start_ns, window.frames)));
+            windows.frame(end, classic(58), &mut |window| seen.push((window.start_ns, window.frames)));
         }
         assert_eq!(seen[8..], [(8_000_000, 0), (9_000_000, 1), (2_250_000, 1), (3_250_000, 1)]);
     }
@@ -452,7 +482,7 @@ mod tests {
             for frame in 1..=frames {
                 let end = window * 1_000_000 + frame * 100_000;
                 windows.advance(end, &mut |_| {});
-                windows.frame(end, 58, &mut |_| {});
+                windows.frame(end, classic(58), &mut |_| {});
             }
         }
         windows.finish(4_000_000, &mut |_| {});

@@ -8,7 +8,7 @@ pub struct WorkLoad {
     previous_ns: Option<i64>,
     instant_pct: Option<f64>,
     instant_max_pct: Option<f64>,
-    bits: u64,
+    bits: f64,
     span_ns: u64,
 }
 
@@ -20,23 +20,24 @@ impl WorkLoad {
             previous_ns: None,
             instant_pct: None,
             instant_max_pct: None,
-            bits: 0,
+            bits: 0.0,
             span_ns: 0,
         }
     }
 
-    /// Takes a frame that ended at `end_ns` and takes `bits` on the bus, intermission included.
+    /// Takes a frame that ended at `end_ns` and takes so many bit times on the bus, intermission included: bits at the nominal rate,
+    /// and those of an FD frame's data phase by how many of the nominal rate last as long.
     #[inline]
-    pub fn frame(&mut self, end_ns: i64, bits: u32) {
+    pub fn frame(&mut self, end_ns: i64, bit_times: f64) {
         if let Some(previous) = self.previous_ns.replace(end_ns)
             && let Ok(interval) = u64::try_from(end_ns.saturating_sub(previous))
         {
             // Where stamps are coarse, frames share one: together they took the interval before or behind them.
-            self.bits += u64::from(bits);
+            self.bits += bit_times;
             if interval == 0 {
                 return;
             }
-            let instant = self.share(u64::from(bits), interval);
+            let instant = self.share(bit_times, interval);
             self.instant_pct = Some(instant);
             self.instant_max_pct = Some(self.instant_max_pct.map_or(instant, |max| max.max(instant)));
             // A file may say anything about times.
@@ -66,8 +67,8 @@ impl WorkLoad {
         (self.span_ns > 0).then(|| self.share(self.bits, self.span_ns))
     }
 
-    fn share(&self, bits: u64, span_ns: u64) -> f64 {
-        let share = bits as f64 * 1e11 / (f64::from(self.bitrate_bps) * span_ns as f64);
+    fn share(&self, bits: f64, span_ns: u64) -> f64 {
+        let share = bits * 1e11 / (f64::from(self.bitrate_bps) * span_ns as f64);
         share.min(100.0)
     }
 }
@@ -80,7 +81,7 @@ mod tests {
     fn back_to_back_frames_measured_a_timer_tick_apart_give_the_golden_work_load() {
         let mut load = WorkLoad::new(1_000_000);
         for n in 0..10 {
-            load.frame(n * 58_125, 58);
+            load.frame(n * 58_125, 58.0);
         }
         let golden = 100.0 * 58.0 / 58.125;
         assert!((load.instant_pct().unwrap() - golden).abs() < 1e-9);
@@ -93,7 +94,7 @@ mod tests {
         let mut load = WorkLoad::new(1_000_000);
         for burst in 0..2000 {
             for frame in 0..5 {
-                load.frame(burst * 1_919_600 + frame * 58_000, 58);
+                load.frame(burst * 1_919_600 + frame * 58_000, 58.0);
             }
         }
         // The first frame has no interval before it, so the mean converges from above.
@@ -104,17 +105,17 @@ mod tests {
     #[test]
     fn the_work_load_never_passes_100_and_leaves_gaps_out() {
         let mut load = WorkLoad::new(1_000_000);
-        load.frame(0, 58);
+        load.frame(0, 58.0);
         assert_eq!(load.instant_pct(), None);
-        load.frame(40_000, 58);
+        load.frame(40_000, 58.0);
         assert_eq!(load.instant_pct(), Some(100.0));
         load.gap();
-        load.frame(10_000_000, 58);
+        load.frame(10_000_000, 58.0);
         assert_eq!(load.instant_pct(), None);
-        load.frame(10_116_000, 58);
+        load.frame(10_116_000, 58.0);
         assert_eq!(load.instant_pct(), Some(50.0));
         // A stamp that does not advance has no interval of its own.
-        load.frame(10_116_000, 58);
+        load.frame(10_116_000, 58.0);
         assert_eq!(load.instant_pct(), Some(50.0));
     }
 
@@ -123,7 +124,7 @@ mod tests {
         let mut load = WorkLoad::new(1_000_000);
         for n in 0..17_241 {
             // Back to back for a second, stamped every millisecond.
-            load.frame((n * 58_000) / 1_000_000 * 1_000_000, 58);
+            load.frame((n * 58_000) / 1_000_000 * 1_000_000, 58.0);
         }
         assert!((load.mean_pct().unwrap() - 100.0).abs() < 0.2, "{:?}", load.mean_pct());
     }

@@ -117,7 +117,8 @@ impl RowDecoder {
             }
         }
         let frame = Frame::from_bus(id, remote, dlc, data);
-        Ok(Some((record(TraceEvent::Frame { frame, direction: Direction::Rx, late: false }), second)))
+        let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
+        Ok(Some((record(event), second)))
     }
 }
 

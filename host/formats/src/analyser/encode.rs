@@ -10,7 +10,7 @@ use super::super::output::Patch;
 use super::super::text::{self, NS_PER_S};
 use super::ERRORS;
 use cantap_trace::bits::FrameBits;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// One row to be written.
 pub(crate) struct TableRow {
@@ -53,7 +53,11 @@ impl RowEncoder {
             left_out.note("channels other than 1, which the analyser's table has no column for");
         }
         let content = match record.event {
-            TraceEvent::Frame { frame, direction, .. } => {
+            TraceEvent::Frame { frame: TraceFrame::Fd(_), .. } => {
+                left_out.note("CAN FD frames, which the analyser's table has no row for");
+                return None;
+            }
+            TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction, .. } => {
                 if direction == Direction::Tx {
                     left_out
                         .note("the direction of sent frames, which the analyser's table has no column for");

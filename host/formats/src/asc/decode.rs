@@ -12,8 +12,9 @@ use super::super::input::Input;
 use super::super::issue::Fault;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
-use super::STATES;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use super::{FD_FORMAT, REMOTE, STATES};
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Reads ASC.
 #[derive(Default)]
@@ -157,7 +158,7 @@ impl Decoder {
         let Some(channel) = channel(second) else { return Ok(Content::Other) };
         let event = match first {
             b"CAN" => status(rest),
-            b"CANFD" => self.flexible(rest)?,
+            b"CANFD" => Some(self.flexible(rest)?),
             _ => None,
         };
         Ok(event.map_or(Content::Other, |event| record(time_ns, channel, event)))
@@ -197,7 +198,7 @@ impl Decoder {
             }
             other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
         };
-        Ok(Classical::Event(TraceEvent::Frame { frame, direction, late: false }))
+        Ok(Classical::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
     }
 
     /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
@@ -211,46 +212,67 @@ impl Decoder {
     }
 
     /// An event on a CAN FD channel, which may be a classical frame.
-    fn flexible(&self, rest: &[u8]) -> Result<Option<TraceEvent>, Fault> {
-        const REMOTE: u32 = 1 << 4;
-        const FD_FORMAT: u32 = 1 << 12;
-        let unsupported = || Fault::Unsupported("a CAN FD frame".into());
+    fn flexible(&self, rest: &[u8]) -> Result<TraceEvent, Fault> {
         let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
-        let direction = match words.next() {
-            Some(b"Rx") => Direction::Rx,
-            Some(b"Tx") => Direction::Tx,
-            _ => return Ok(None),
+        let mut next = || words.next().unwrap_or_default();
+        let direction = match next() {
+            b"Rx" => Direction::Rx,
+            b"Tx" => Direction::Tx,
+            other => return Err(Fault::malformed("'Rx' or 'Tx' behind the channel", other)),
         };
-        let Some(id) = words.next() else { return Ok(None) };
-        if id.eq_ignore_ascii_case(b"ErrorFrame") {
-            return Ok(Some(TraceEvent::BusError { kind: None, counters: None }));
+        let word = next();
+        if word.eq_ignore_ascii_case(b"ErrorFrame") {
+            return Ok(TraceEvent::BusError { kind: None, counters: None });
         }
-        let (raw, extended) = self.identifier(id).ok_or_else(unsupported)?;
-        let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(unsupported)?;
+        let parsed = self.identifier(word);
+        let id =
+            parsed.and_then(|(raw, extended)| if extended { Id::extended(raw) } else { Id::standard(raw) });
+        let id = id.ok_or_else(|| {
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", word)
+        })?;
         // An optional symbolic name, then BRS, ESI, DLC, data length, data, duration, bits, flags.
-        let mut next = words.next();
-        if !matches!(next, Some(b"0" | b"1")) {
-            next = words.next();
-        }
-        let esi = words.next();
-        let dlc = words.next().and_then(text::hex).filter(|dlc| *dlc < 16);
-        let len = words.next().and_then(text::decimal).filter(|len| *len <= 64);
-        let (Some(_), Some(_), Some(dlc), Some(len)) = (next, esi, dlc, len) else {
-            return Err(unsupported());
+        let flag = |word: &[u8]| match word {
+            b"0" => Some(false),
+            b"1" => Some(true),
+            _ => None,
         };
-        let mut data = [0; 8];
-        for at in 0..len as usize {
-            let byte = words.next().and_then(|word| self.byte(word)).ok_or_else(unsupported)?;
-            if let Some(slot) = data.get_mut(at) {
-                *slot = byte;
-            }
+        let mut word = next();
+        if flag(word).is_none() {
+            word = next();
         }
-        let flags = words.nth(2).and_then(text::hex).ok_or_else(unsupported)?;
-        if flags & FD_FORMAT != 0 || len > 8 {
-            return Err(unsupported());
+        let expected = "BRS and ESI as 0 or 1, a length code and a number of bytes behind the identifier";
+        let brs = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
+        let word = next();
+        let esi = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
+        let word = next();
+        let dlc = text::hex(word).filter(|dlc| *dlc < 16);
+        let dlc = dlc.ok_or_else(|| Fault::malformed(expected, word))? as u8;
+        let word = next();
+        let len = text::decimal(word).filter(|len| *len <= FD_MAX_BYTES as u64);
+        let len = len.ok_or_else(|| Fault::malformed(expected, word))? as usize;
+        let mut data = [0; FD_MAX_BYTES];
+        for slot in &mut data[..len] {
+            let word = next();
+            *slot = self.byte(word).ok_or_else(|| Fault::malformed(format!("{len} data bytes"), word))?;
         }
-        let frame = Frame::from_bus(id, flags & REMOTE != 0, dlc as u8, data);
-        Ok(Some(TraceEvent::Frame { frame, direction, late: false }))
+        let (_duration, _bits, word) = (next(), next(), next());
+        let flags = text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?;
+        let frame = if flags & FD_FORMAT != 0 {
+            let frame = FdFrame::new(id, brs, esi, &data[..len]);
+            frame.filter(|_| usize::from(FD_LENGTHS[usize::from(dlc)]) == len).map(TraceFrame::Fd)
+        } else {
+            let remote = flags & REMOTE != 0;
+            let frame = data.first_chunk().map(|data| Frame::from_bus(id, remote, dlc, *data));
+            // A remote frame has no data, and the length is the one that it asks for or none.
+            frame.filter(|frame| remote || frame.data_len() == len).map(TraceFrame::Classic)
+        };
+        let frame = frame.ok_or_else(|| {
+            Fault::malformed(
+                "a length code that means the number of bytes",
+                format!("{dlc:x} {len}").as_bytes(),
+            )
+        })?;
+        Ok(TraceEvent::Frame { frame, direction, late: false })
     }
 
     #[inline]

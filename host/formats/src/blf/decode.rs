@@ -13,13 +13,17 @@ use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
 use super::super::sja1000;
+use super::kinds::{group, is_bookkeeping};
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR, CAN_ERROR_EXT, CAN_FD_ERROR_64, CAN_FD_MESSAGE, CAN_FD_MESSAGE_64,
     CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES, DATA_LOST_END,
-    DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE,
-    LOG_CONTAINER, OBJECT_MAGIC, OWN_MARK, REMOTE, REQUESTED, SENT, START_OFFSET, TIME_IN_TEN_US,
+    DIRECTION, EVENT_COMMENT, EXTENDED, FD_FORMAT, FD_PASSIVE_SENDER, FD_SWITCHED_BIT_RATE, FD64_FORMAT,
+    FD64_PASSIVE_SENDER, FD64_REMOTE, FD64_SWITCHED_BIT_RATE, FILE_BYTES_OFFSET, FILE_HEADER_BYTES,
+    FILE_MAGIC, HAS_SJA1000_CODE, LOG_CONTAINER, OBJECT_MAGIC, OWN_MARK, REMOTE, REQUESTED, SENT,
+    START_OFFSET, TIME_IN_TEN_US,
 };
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// The numbers of [`OWN_MARK`]'s kinds, from 1.
 pub(crate) const KINDS: [BusErrorKind; 6] = [
@@ -96,6 +100,7 @@ const EXPECTED_OBJECT: &str = "an object that begins with LOBJ";
 enum Object {
     Event(TraceRecord),
     Request,
+    LeftOut(&'static str),
     Other,
     Issue(Fault),
     /// The rest is in the next container, if there is one.
@@ -118,6 +123,7 @@ impl Decode for Decoder {
             match self.object() {
                 Object::Event(record) => return Ok(Found::Record(record)),
                 Object::Request => return Ok(Found::Note(REQUESTS_TO_SEND)),
+                Object::LeftOut(what) => return Ok(Found::LeftOut(what)),
                 Object::Other => {}
                 Object::Issue(fault) => return Ok(Found::Issue(Place::Offset(self.container), fault)),
                 Object::Incomplete => {
@@ -273,8 +279,14 @@ impl Decoder {
         let Some(object) = rest.get(..len) else { return Object::Incomplete };
         let kind = u32_at(object, 12);
         self.at += len;
-        if !matches!(version, 1 | 2) || header_len < BASE_HEADER_BYTES + 16 {
-            return Object::Other;
+        // Only with these headers is the time where it is looked for.
+        if !matches!(version, 1 | 2) {
+            let found = format!("version {version}");
+            return Object::Issue(Fault::malformed("an object's header of version 1 or 2", found.as_bytes()));
+        }
+        if header_len < BASE_HEADER_BYTES + 16 {
+            let found = format!("{header_len} bytes");
+            return Object::Issue(Fault::malformed("an object's header with a time", found.as_bytes()));
         }
         let time = u64_at(object, 24);
         let offset_ns = if u32_at(object, 16) == TIME_IN_TEN_US { time.saturating_mul(10_000) } else { time };
@@ -287,6 +299,7 @@ impl Decoder {
                 Object::Event(TraceRecord { time_ns, channel, event })
             }
             Ok(Content::Request) => Object::Request,
+            Ok(Content::LeftOut(what)) => Object::LeftOut(what),
             Ok(Content::Other) => Object::Other,
             Err(fault) => Object::Issue(fault),
         }
@@ -372,7 +385,9 @@ enum Content {
     Event(u8, TraceEvent),
     /// The mere request to send a frame.
     Request,
-    /// Something of no interest.
+    /// Something that a trace of CAN does not hold, by kind.
+    LeftOut(&'static str),
+    /// Something that nobody misses.
     Other,
 }
 
@@ -386,7 +401,11 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content, Fault> {
         let expected = format!("at least {len} bytes of fields in an object of type {kind}");
         Err(Fault::malformed(expected, format!("{found} bytes").as_bytes()))
     };
-    let channel = u8::try_from(u16_at(fields, 0)).unwrap_or(u8::MAX);
+    let channel = || {
+        let channel = u16_at(fields, 0);
+        u8::try_from(channel)
+            .map_err(|_| Fault::malformed("a channel of 0 to 255", channel.to_string().as_bytes()))
+    };
     let unknown_error = TraceEvent::BusError { kind: None, counters: None };
     let on = |channel| {
         move |event: Option<_>| event.map_or(Content::Request, |event| Content::Event(channel, event))
@@ -394,37 +413,38 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content, Fault> {
     Ok(match kind {
         CAN_MESSAGE | CAN_MESSAGE2 => {
             need(16)?;
-            frame(fields[2], fields[3], u32_at(fields, 4), &fields[8..16]).map(on(channel))?
+            frame(fields[2], fields[3], u32_at(fields, 4), &fields[8..16]).map(on(channel()?))?
         }
         CAN_FD_MESSAGE => {
-            const FD_FORMAT: u8 = 1;
             need(28)?;
-            if fields[13] & FD_FORMAT != 0 {
-                return Err(Fault::Unsupported("a CAN FD frame".into()));
+            let (flags, dlc, id) = (fields[2], fields[3], u32_at(fields, 4));
+            let has = |flag| fields[13] & flag != 0;
+            if has(FD_FORMAT) {
+                let (brs, esi) = (has(FD_SWITCHED_BIT_RATE), has(FD_PASSIVE_SENDER));
+                fd_frame(flags, dlc, id, brs, esi, valid(&fields[20..], fields[14])).map(on(channel()?))?
+            } else {
+                frame(flags, dlc, id, &fields[20..28]).map(on(channel()?))?
             }
-            frame(fields[2], fields[3], u32_at(fields, 4), &fields[20..28]).map(on(channel))?
         }
         CAN_FD_MESSAGE_64 => {
-            const FD_REMOTE: u32 = 1 << 4;
-            const FD_FORMAT: u32 = 1 << 12;
             need(40)?;
-            let flags = u32_at(fields, 12);
-            if flags & FD_FORMAT != 0 {
-                return Err(Fault::Unsupported("a CAN FD frame".into()));
-            }
-            let remote = if flags & FD_REMOTE != 0 { REMOTE } else { 0 };
-            // Valid bytes may be more than there are; those missing are zero.
-            let mut data = [0; 8];
-            let present = fields[40..].len().min(usize::from(fields[2])).min(8);
-            data[..present].copy_from_slice(&fields[40..40 + present]);
+            let (dlc, id) = (fields[1], u32_at(fields, 4));
+            let has = |flag| u32_at(fields, 12) & flag != 0;
             let direction = fields[34] & DIRECTION;
-            frame(remote | direction, fields[1], u32_at(fields, 4), &data).map(on(fields[0]))?
+            let data = valid(&fields[40..], fields[2]);
+            if has(FD64_FORMAT) {
+                let (brs, esi) = (has(FD64_SWITCHED_BIT_RATE), has(FD64_PASSIVE_SENDER));
+                fd_frame(direction, dlc, id, brs, esi, data).map(on(fields[0]))?
+            } else {
+                let remote = if has(FD64_REMOTE) { REMOTE } else { 0 };
+                frame(remote | direction, dlc, id, data).map(on(fields[0]))?
+            }
         }
-        CAN_ERROR => Content::Event(channel, unknown_error),
+        CAN_ERROR => Content::Event(channel()?, unknown_error),
         CAN_FD_ERROR_64 => Content::Event(fields.first().copied().unwrap_or_default(), unknown_error),
         CAN_ERROR_EXT => {
             need(32)?;
-            Content::Event(channel, error_ext(fields))
+            Content::Event(channel()?, error_ext(fields))
         }
         DATA_LOST_END if !loss_told => {
             need(16)?;
@@ -441,20 +461,32 @@ fn event(kind: u32, fields: &[u8], loss_told: bool) -> Result<Content, Fault> {
                 u8::try_from(super::super::text::decimal(number)?).ok()
             });
             let event = channel.zip(event_text::marked(text));
-            event.map_or(Content::Other, |(channel, event)| Content::Event(channel, event))
+            event.map_or(Content::LeftOut(group(kind)), |(channel, event)| Content::Event(channel, event))
         }
-        _ => Content::Other,
+        DATA_LOST_END => Content::Other,
+        _ if is_bookkeeping(kind) => Content::Other,
+        _ => Content::LeftOut(group(kind)),
     })
 }
 
-/// A frame; `None` for the mere request to send one.
+/// The first `len` bytes. Valid bytes may be more than there are: those missing are zero.
+fn valid(data: &[u8], len: u8) -> &[u8] {
+    &data[..data.len().min(usize::from(len))]
+}
+
+/// A frame's direction; `None` for the mere request to send one.
 #[inline]
-fn frame(flags: u8, dlc: u8, id: u32, data: &[u8]) -> Result<Option<TraceEvent>, Fault> {
-    let direction = match flags & DIRECTION {
-        SENT => Direction::Tx,
-        REQUESTED => return Ok(None),
-        _ => Direction::Rx,
-    };
+fn direction(flags: u8) -> Option<Direction> {
+    match flags & DIRECTION {
+        SENT => Some(Direction::Tx),
+        REQUESTED => None,
+        _ => Some(Direction::Rx),
+    }
+}
+
+/// A frame's identifier and length code, checked.
+#[inline]
+fn id_and_dlc(id: u32, dlc: u8) -> Result<Id, Fault> {
     let raw = id & !EXTENDED;
     let parsed = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
     let fault =
@@ -463,11 +495,38 @@ fn frame(flags: u8, dlc: u8, id: u32, data: &[u8]) -> Result<Option<TraceEvent>,
     if dlc > 15 {
         return Err(fault("a data length code of 0 to 0xf", u32::from(dlc)));
     }
+    Ok(parsed)
+}
+
+/// A CAN FD frame; `None` for the mere request to send one.
+fn fd_frame(
+    flags: u8,
+    dlc: u8,
+    id: u32,
+    brs: bool,
+    esi: bool,
+    data: &[u8],
+) -> Result<Option<TraceEvent>, Fault> {
+    let Some(direction) = direction(flags) else { return Ok(None) };
+    let id = id_and_dlc(id, dlc)?;
+    let mut bytes = [0; FD_MAX_BYTES];
+    let len = usize::from(FD_LENGTHS[usize::from(dlc)]);
+    let present = data.len().min(len);
+    bytes[..present].copy_from_slice(&data[..present]);
+    let frame = FdFrame::new(id, brs, esi, &bytes[..len]);
+    Ok(frame.map(|frame| TraceEvent::Frame { frame: TraceFrame::Fd(frame), direction, late: false }))
+}
+
+/// A classical frame; `None` for the mere request to send one.
+#[inline]
+fn frame(flags: u8, dlc: u8, id: u32, data: &[u8]) -> Result<Option<TraceEvent>, Fault> {
+    let Some(direction) = direction(flags) else { return Ok(None) };
+    let parsed = id_and_dlc(id, dlc)?;
     let mut bytes = [0; 8];
     let len = data.len().min(8);
     bytes[..len].copy_from_slice(&data[..len]);
     let frame = Frame::from_bus(parsed, flags & REMOTE != 0, dlc, bytes);
-    Ok(Some(TraceEvent::Frame { frame, direction, late: false }))
+    Ok(Some(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
 }
 
 /// An error object: ours exactly, others as far as the controller's code tells.

@@ -9,12 +9,13 @@ use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::sja1000;
 use super::{
-    BASE_HEADER_BYTES, CAN_ERROR_EXT, CAN_MESSAGE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES, DATA_LOST_END,
-    EVENT_COMMENT, EXTENDED, FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE, HEADER_BYTES, LOG_CONTAINER,
-    OBJECT_MAGIC, OWN_MARK, REMOTE, SENT, TIME_IN_NS,
+    BASE_HEADER_BYTES, CAN_ERROR_EXT, CAN_FD_MESSAGE, CAN_MESSAGE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
+    DATA_LOST_END, EVENT_COMMENT, EXTENDED, FD_FORMAT, FD_PASSIVE_SENDER, FD_SWITCHED_BIT_RATE,
+    FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE, HEADER_BYTES, LOG_CONTAINER, OBJECT_MAGIC, OWN_MARK,
+    REMOTE, SENT, TIME_IN_NS,
 };
 use crate::blf::decode::KINDS;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// Bytes of objects per container, as Vector's own writer has it.
 const CONTAINER_BYTES: usize = 128 * 1024;
@@ -177,7 +178,23 @@ impl Encode for Encoder {
         self.stop_ns = self.stop_ns.max(record.time_ns);
         let channel = u16::from(record.channel).to_le_bytes();
         match &record.event {
-            TraceEvent::Frame { frame, direction, .. } => {
+            TraceEvent::Frame { frame: TraceFrame::Fd(frame), direction, .. } => {
+                // Behind the data are four bytes in reserve.
+                let mut fields = [0; 20 + 64 + 4];
+                let id = frame.id();
+                fields[..2].copy_from_slice(&channel);
+                fields[2] = if *direction == Direction::Tx { SENT } else { 0 };
+                fields[3] = frame.dlc();
+                let extended = if id.is_extended() { EXTENDED } else { 0 };
+                fields[4..8].copy_from_slice(&(id.raw() | extended).to_le_bytes());
+                fields[13] = FD_FORMAT
+                    | if frame.brs() { FD_SWITCHED_BIT_RATE } else { 0 }
+                    | if frame.esi() { FD_PASSIVE_SENDER } else { 0 };
+                fields[14] = frame.data_len() as u8;
+                fields[20..20 + frame.data_len()].copy_from_slice(frame.data());
+                self.object(CAN_FD_MESSAGE, offset_ns, &fields);
+            }
+            TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction, .. } => {
                 let id = frame.id();
                 let extended = if id.is_extended() { EXTENDED } else { 0 };
                 let remote = if frame.is_remote() { REMOTE } else { 0 };

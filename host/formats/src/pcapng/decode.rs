@@ -16,8 +16,9 @@ use super::{
     IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OBSOLETE_PACKET, OUTBOUND, REMOTE,
     SECTION_HEADER, SIMPLE_PACKET,
 };
+use cantap_trace::fd::{FLAG_BRS, FLAG_ESI};
 use cantap_trace::socketcan::ERROR_FLAG;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 
 /// Longest block of a trace; far above what a CAN packet takes.
 const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
@@ -289,7 +290,7 @@ impl Decoder {
             }
             [_, _, _, _, len, ..] if len & XL_FORMAT != 0 => Err(Fault::Unsupported("a CAN XL frame".into())),
             [_, _, _, _, len, kind, ..] if kind & FD_FORMAT != 0 || *len > 8 => {
-                Err(Fault::Unsupported("a CAN FD frame".into()))
+                flexible(packet, flags).map(|event| (event, None))
             }
             _ => event(packet, flags, &mut self.error_frames),
         };
@@ -313,6 +314,31 @@ impl Decoder {
     }
 }
 
+/// A packet's identifier, without its flags.
+fn identifier(id: u32) -> Result<Id, Fault> {
+    let raw = id & !(EXTENDED | REMOTE);
+    let parsed = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
+    parsed.ok_or_else(|| Fault::malformed("an identifier up to 0x7ff", format!("{raw:#x}").as_bytes()))
+}
+
+/// What the flags of a packet's block say of its direction.
+fn direction(flags: u32) -> Direction {
+    if flags & DIRECTION == OUTBOUND { Direction::Tx } else { Direction::Rx }
+}
+
+/// A CAN FD packet.
+fn flexible(packet: &[u8], flags: u32) -> Result<TraceEvent, Fault> {
+    let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
+    let (len, kind) = (packet[4], packet[5]);
+    let data = packet[8..].get(..usize::from(len)).ok_or_else(|| {
+        Fault::malformed(format!("{len} data bytes"), (packet.len() - 8).to_string().as_bytes())
+    })?;
+    let frame = FdFrame::new(identifier(id)?, kind & FLAG_BRS != 0, kind & FLAG_ESI != 0, data);
+    let frame = frame
+        .ok_or_else(|| Fault::malformed("a length that CAN FD has", format!("{len} bytes").as_bytes()))?;
+    Ok(TraceEvent::Frame { frame: frame.into(), direction: direction(flags), late: false })
+}
+
 /// What a classical packet says.
 #[inline]
 fn event(
@@ -332,14 +358,10 @@ fn event(
     if present < usize::from(len) && !remote {
         return Err(Fault::malformed(format!("{len} data bytes"), format!("{present}").as_bytes()));
     }
-    let raw = id & !(EXTENDED | REMOTE);
-    let parsed = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
-    let parsed = parsed
-        .ok_or_else(|| Fault::malformed("an identifier up to 0x7ff", format!("{raw:#x}").as_bytes()))?;
+    let parsed = identifier(id)?;
     let dlc = if len == 8 && (9..=15).contains(&raw_dlc) { raw_dlc } else { len };
-    let direction = if flags & DIRECTION == OUTBOUND { Direction::Tx } else { Direction::Rx };
     let frame = Frame::from_bus(parsed, remote, dlc, data);
-    Ok((TraceEvent::Frame { frame, direction, late: false }, None))
+    Ok((TraceEvent::Frame { frame: frame.into(), direction: direction(flags), late: false }, None))
 }
 
 impl Interface {

@@ -4,12 +4,13 @@ use super::super::codec::Encode;
 use super::super::interfaces;
 use super::super::left_out::LeftOut;
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED, IF_NAME,
-    IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OUTBOUND, PACKET_BYTES, REMOTE, SECTION_HEADER,
-    SHB_USERAPPL,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED,
+    FD_PACKET_BYTES, IF_NAME, IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OUTBOUND, PACKET_BYTES, REMOTE,
+    SECTION_HEADER, SHB_USERAPPL,
 };
+use cantap_trace::fd::FLAG_FDF;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 /// Times are in nanoseconds: 10 to the power of minus this.
 const RESOLUTION: u8 = 9;
@@ -74,12 +75,23 @@ impl Encoder {
     }
 }
 
-/// A record as SocketCAN's packet.
+/// A CAN FD frame as SocketCAN's packet, always of the full length: readers tell the two kinds by it.
+fn fd_packet(frame: &FdFrame) -> [u8; FD_PACKET_BYTES] {
+    let mut packet = [0; FD_PACKET_BYTES];
+    let extended = if frame.id().is_extended() { EXTENDED } else { 0 };
+    packet[..4].copy_from_slice(&(frame.id().raw() | extended).to_be_bytes());
+    packet[4] = frame.data_len() as u8;
+    packet[5] = FLAG_FDF | frame.flags();
+    packet[8..8 + frame.data_len()].copy_from_slice(frame.data());
+    packet
+}
+
+/// A record as SocketCAN's packet; a CAN FD frame is [`fd_packet`]'s.
 #[inline]
 fn packet(event: &TraceEvent) -> [u8; PACKET_BYTES] {
     let mut packet = [0; PACKET_BYTES];
     let id = match event {
-        TraceEvent::Frame { frame, .. } => {
+        TraceEvent::Frame { frame: TraceFrame::Classic(frame), .. } => {
             packet[4] = frame.dlc().min(8);
             if frame.dlc() > 8 {
                 packet[7] = frame.dlc();
@@ -108,11 +120,15 @@ impl Encode for Encoder {
         let interface = self.interface(record.channel, out);
         block(out, ENHANCED_PACKET, |out| {
             let time = record.time_ns.cast_unsigned();
-            let len = PACKET_BYTES as u32;
+            let fd = record.frame().and_then(TraceFrame::fd);
+            let len = if fd.is_some() { FD_PACKET_BYTES } else { PACKET_BYTES } as u32;
             for field in [interface, (time >> 32) as u32, time as u32, len, len] {
                 out.extend_from_slice(&field.to_le_bytes());
             }
-            out.extend_from_slice(&packet(&record.event));
+            match fd {
+                Some(frame) => out.extend_from_slice(&fd_packet(frame)),
+                None => out.extend_from_slice(&packet(&record.event)),
+            }
             match &record.event {
                 TraceEvent::Frame { direction: Direction::Tx, .. } => {
                     option(out, EPB_FLAGS, &OUTBOUND.to_le_bytes());

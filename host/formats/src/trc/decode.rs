@@ -13,7 +13,8 @@ use super::super::input::Input;
 use super::super::issue::Fault;
 use super::super::text;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 const NS_PER_MS: i64 = 1_000_000;
 
@@ -39,6 +40,8 @@ struct Layout {
     id: usize,
     direction: Option<usize>,
     len: usize,
+    /// The length is a number of bytes, not the code of the bus.
+    len_is_bytes: bool,
     data: usize,
 }
 
@@ -47,7 +50,7 @@ impl Layout {
     fn of(version: TrcVersion) -> Self {
         let fixed = |kind, bus, id, len| {
             let direction = kind;
-            Self { offset: 1, kind, bus, id, direction, len, data: len + 1 }
+            Self { offset: 1, kind, bus, id, direction, len, len_is_bytes: false, data: len + 1 }
         };
         match version {
             TrcVersion::V1_0 => fixed(None, None, 2, 3),
@@ -73,6 +76,7 @@ impl Layout {
             id: find(b"I")?,
             direction: find(b"d"),
             len: find(b"L").or_else(|| find(b"l"))?,
+            len_is_bytes: find(b"L").is_none(),
             data: find(b"D")?,
         })
     }
@@ -167,8 +171,7 @@ impl Decoder {
                 columns[layout.id] != WARNING_ID && !rest.trim_ascii().starts_with(b"ERROR")
             }
             b"Rx" | b"Tx" if self.version < TrcVersion::V2_0 => true,
-            b"DT" | b"RR" => true,
-            b"FD" | b"FB" | b"FE" | b"BI" => return Err(Fault::Unsupported("a CAN FD frame".into())),
+            b"DT" | b"RR" | b"FD" | b"FB" | b"FE" | b"BI" => true,
             _ => false,
         };
         if !frame_kind {
@@ -187,6 +190,12 @@ impl Decoder {
             _ => Direction::Rx,
         };
         let len = columns[layout.len];
+        if let b"FD" | b"FB" | b"FE" | b"BI" = kind {
+            let (brs, esi) = (matches!(kind, b"FB" | b"BI"), matches!(kind, b"FE" | b"BI"));
+            let frame = flexible(id, brs, esi, len, layout.len_is_bytes, rest)?;
+            let event = TraceEvent::Frame { frame, direction, late: false };
+            return Ok(Some(TraceRecord { time_ns, channel, event }));
+        }
         let dlc = text::decimal(len)
             .filter(|dlc| *dlc <= 15)
             .ok_or_else(|| Fault::malformed("a length of 0 to 15", len))? as u8;
@@ -205,7 +214,7 @@ impl Decoder {
             }
         }
         let frame = Frame::from_bus(id, remote, dlc, data);
-        let event = TraceEvent::Frame { frame, direction, late: false };
+        let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
         Ok(Some(TraceRecord { time_ns, channel, event }))
     }
 
@@ -254,6 +263,38 @@ impl Decoder {
         };
         (!told.is_some_and(same)).then_some(record)
     }
+}
+
+/// A CAN FD frame: `len` is the length's column, `rest` what stands behind it.
+fn flexible(
+    id: Id,
+    brs: bool,
+    esi: bool,
+    len: &[u8],
+    len_is_bytes: bool,
+    rest: &[u8],
+) -> Result<TraceFrame, Fault> {
+    let number = text::decimal(len).and_then(|number| usize::try_from(number).ok());
+    let bytes = match number {
+        Some(number) if len_is_bytes => Some(number).filter(|number| *number <= FD_MAX_BYTES),
+        Some(dlc) => FD_LENGTHS.get(dlc).map(|len| usize::from(*len)),
+        None => None,
+    };
+    let expected = "a length that CAN FD has: a code of 0 to 15, in the column 'l' 0 to 64 bytes";
+    let bytes = bytes.ok_or_else(|| Fault::malformed(expected, len))?;
+    let mut data = [0; FD_MAX_BYTES];
+    let mut at = rest;
+    for slot in &mut data[..bytes] {
+        let (word, after) = text::word(at);
+        let byte = match word {
+            [high, low] => text::hex_pair(*high, *low),
+            _ => None,
+        };
+        *slot = byte.ok_or_else(|| Fault::malformed(format!("{bytes} data bytes"), rest.trim_ascii()))?;
+        at = after;
+    }
+    let frame = FdFrame::new(id, brs, esi, &data[..bytes]);
+    frame.map(TraceFrame::Fd).ok_or_else(|| Fault::malformed(expected, len))
 }
 
 /// The channel that an event's text names.

@@ -6,9 +6,11 @@ use super::super::event_text;
 use super::super::left_out::LeftOut;
 use super::super::text;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_code, status_of};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
 const NS_PER_MS: i64 = 1_000_000;
+
+const NO_BUS: &str = "the channel of frames, which this version of TRC has no column for";
 
 /// Writes TRC.
 pub(crate) struct Encoder {
@@ -178,7 +180,7 @@ impl Encoder {
     ) {
         let version = self.version;
         if !version.has_bus() && record.channel != 1 {
-            left_out.note("the channel of frames, which this version of TRC has no column for");
+            left_out.note(NO_BUS);
         }
         let direction_text: &[u8] = match direction {
             Direction::Rx => b"Rx",
@@ -242,6 +244,47 @@ impl Encoder {
                 out.push(b' ');
                 text::push_hex_byte(out, *byte);
             }
+        }
+    }
+
+    /// A CAN FD frame, which version 2 has rows for.
+    fn flexible(
+        &mut self,
+        record: &TraceRecord,
+        frame: &FdFrame,
+        direction: Direction,
+        out: &mut Vec<u8>,
+        left_out: &mut LeftOut,
+    ) {
+        if !self.version.has_bus() && record.channel != 1 {
+            left_out.note(NO_BUS);
+        }
+        out.extend_from_slice(match (frame.brs(), frame.esi()) {
+            (false, false) => b"FD ",
+            (true, false) => b"FB ",
+            (false, true) => b"FE ",
+            (true, true) => b"BI ",
+        });
+        self.bus(record.channel, out);
+        let id = frame.id();
+        let (digits, spaces) = if id.is_extended() { (8, 0) } else { (4, 4) };
+        out.resize(out.len() + spaces, b' ');
+        text::push_hex(out, id.raw(), digits);
+        out.extend_from_slice(if direction == Direction::Tx { b" Tx " } else { b" Rx " });
+        let (number, width) = if self.version.has_length() {
+            (frame.data_len() as u8, 2)
+        } else {
+            out.extend_from_slice(b"-  ");
+            (frame.dlc(), 4)
+        };
+        let at = out.len();
+        text::push_decimal(out, u64::from(number));
+        if frame.data_len() > 0 {
+            text::pad_right(out, at, width);
+        }
+        for byte in frame.data() {
+            out.push(b' ');
+            text::push_hex_byte(out, *byte);
         }
     }
 
@@ -320,13 +363,20 @@ impl Encode for Encoder {
             None => self.head(record.time_ns, out),
         };
         let offset_ns = record.time_ns.saturating_sub(start_ns);
+        if self.version < TrcVersion::V2_0 && record.frame().is_some_and(TraceFrame::is_fd) {
+            left_out.note("CAN FD frames, which TRC has since version 2.0");
+            return;
+        }
         let resolution_ns = NS_PER_MS / 10_i64.pow(self.version.decimals());
         if resolution_ns > 1000 && offset_ns % resolution_ns != 0 {
             left_out.note("the digits of times beyond this version's resolution");
         }
         self.row(offset_ns, out);
         match &record.event {
-            TraceEvent::Frame { frame, direction, .. } => {
+            TraceEvent::Frame { frame: TraceFrame::Fd(frame), direction, .. } => {
+                self.flexible(record, frame, *direction, out, left_out);
+            }
+            TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction, .. } => {
                 self.frame(record, frame, *direction, out, left_out);
             }
             _ if self.version >= TrcVersion::V2_0 => self.event_2(record, offset_ns, out),

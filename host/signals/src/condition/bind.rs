@@ -1,6 +1,7 @@
 //! A condition bound to databases, evaluated record by record.
 
 use crate::{Decoder, MessageRef, Signal, SignalValue, Suggestion};
+use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::error::{ConditionError, ConditionFault};
@@ -171,7 +172,7 @@ fn constant(expression: &Expression) -> Option<f64> {
 
 /// The place of a data byte, if there can be a byte at it.
 fn byte_index(value: f64) -> Option<usize> {
-    const MOST: f64 = 7.0;
+    const MOST: f64 = (FD_MAX_BYTES - 1) as f64;
     (value.fract() == 0.0 && (0.0..=MOST).contains(&value)).then_some(value as usize)
 }
 
@@ -417,10 +418,10 @@ mod tests {
             ("Engine.Speed == Fast", "Engine.Speed has no value \"Fast\"\n"),
             (
                 "byte[-1] == 1",
-                "a frame has no byte -1; bytes are counted from 0 to 7\n  byte[-1] == 1\n       ^",
+                "a frame has no byte -1; bytes are counted from 0 to 7, in CAN FD to 63\n  byte[-1] == 1\n       ^",
             ),
             ("byte[1 + 0.5] == 1", "a frame has no byte 1.5; "),
-            ("byte[8] == 1", "a frame has no byte 8; "),
+            ("byte[64] == 1", "a frame has no byte 64; "),
             ("'Drive' > 1", "a text can only be compared with a signal, by == or !=\n  'Drive' > 1\n  ^"),
         ] {
             let error = Condition::new(text, &decoder()).unwrap_err().to_string();

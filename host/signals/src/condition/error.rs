@@ -40,7 +40,7 @@ pub enum ConditionFault {
     #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
     Chained,
     /// No place of a data byte.
-    #[error("a frame has no byte {0}; bytes are counted from 0 to 7")]
+    #[error("a frame has no byte {0}; bytes are counted from 0 to 7, in CAN FD to 63")]
     ByteIndex(String),
     /// A name of nothing.
     #[error("there is no signal {name:?}{near}")]

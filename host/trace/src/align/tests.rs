@@ -10,7 +10,7 @@ fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {
     TraceRecord {
         time_ns,
         channel,
-        event: TraceEvent::Frame { frame, direction: Direction::Rx, late: false },
+        event: TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false },
     }
 }
 

@@ -2,11 +2,10 @@
 
 use std::collections::VecDeque;
 
-use cantap_wire::Frame;
 use hdrhistogram::Histogram;
 
 use super::Alignment;
-use crate::{TraceEvent, TraceRecord};
+use crate::{TraceEvent, TraceFrame, TraceRecord};
 
 /// The longest difference that is counted, in nanoseconds: beyond every tolerance.
 const MOST_NS: u64 = 1_000_000_000;
@@ -27,7 +26,7 @@ struct Waiting {
     time_ns: i64,
     /// Which of the pairs of channels.
     bus: usize,
-    frame: Frame,
+    frame: TraceFrame,
     late: bool,
 }
 

@@ -1,0 +1,34 @@
+//! What else is in BLF files: the objects of other buses and of the measurement, by the group that a user knows.
+//!
+//! Numbers from Tobias Lorenz's vector_blf (`ObjectHeaderBase.h`).
+
+/// What an object is that is no part of a trace of CAN, in words.
+pub(super) fn group(kind: u32) -> &'static str {
+    match kind {
+        3 => "CAN overload frames",
+        4 => "CAN statistics",
+        5 | 96 | 127 | 128 => "triggers and markers",
+        6..=9 | 72 => "environment and system variables",
+        11..=21 | 42 | 43 | 54 | 57..=64 | 75 | 87..=89 | 105 => "LIN frames and events",
+        22..=25 | 32..=39 | 67..=70 | 76..=85 | 95 => "MOST frames and events",
+        29 | 30 | 40 | 41 | 45 | 47..=50 | 66 => "FlexRay frames and events",
+        31 | 44 | 74 => "CAN driver errors",
+        46 => "GPS positions",
+        55 | 56 => "J1708 frames",
+        65 | 92 => "comments and texts",
+        71 | 102 | 103 | 114 | 120..=122 => "Ethernet frames and events",
+        90 => "serial port events",
+        91 => "overruns of other buses",
+        93 | 94 => "WLAN frames and events",
+        97 | 98 | 106 | 107 | 109 => "AFDX frames and events",
+        99 | 118 | 119 => "diagnostics and tests",
+        110..=113 => "ARINC 429 frames and events",
+        _ => "objects of other kinds",
+    }
+}
+
+/// Objects that only say how the file or the measurement is made, of which none is missed: real-time clock, empty places,
+/// the beginning of a loss whose end tells how much was lost, settings, attributes.
+pub(super) const fn is_bookkeeping(kind: u32) -> bool {
+    matches!(kind, 0 | 51 | 115 | 125 | 129 | 130 | 131 | 132)
+}

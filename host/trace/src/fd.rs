@@ -1,0 +1,108 @@
+//! A CAN FD frame. Devices of cantap are classic ones; traces from other tools are full of these.
+
+use std::fmt;
+
+use cantap_can::Id;
+
+/// The data length that each code of the bus stands for in an FD frame (ISO 11898-1:2015, table 5).
+pub const FD_LENGTHS: [u8; 16] = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64];
+
+/// Data bytes that an FD frame carries at most.
+pub const FD_MAX_BYTES: usize = 64;
+
+/// A CAN FD data frame; there are no remote ones.
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct FdFrame {
+    id: Id,
+    dlc: u8,
+    brs: bool,
+    esi: bool,
+    data: [u8; FD_MAX_BYTES],
+}
+
+impl FdFrame {
+    /// A frame with these bytes; `None` if FD has no code for their number ([`FD_LENGTHS`]).
+    ///
+    /// `brs`: the data phase has a bit rate of its own. `esi`: the sender is error passive.
+    pub fn new(id: Id, brs: bool, esi: bool, bytes: &[u8]) -> Option<Self> {
+        let dlc = FD_LENGTHS.iter().position(|len| usize::from(*len) == bytes.len())? as u8;
+        let mut data = [0; FD_MAX_BYTES];
+        data[..bytes.len()].copy_from_slice(bytes);
+        Some(Self { id, dlc, brs, esi, data })
+    }
+
+    /// The identifier.
+    pub const fn id(&self) -> Id {
+        self.id
+    }
+
+    /// Whether the data phase has a bit rate of its own.
+    pub const fn brs(&self) -> bool {
+        self.brs
+    }
+
+    /// Whether the sender is error passive.
+    pub const fn esi(&self) -> bool {
+        self.esi
+    }
+
+    /// The data length code as on the bus, 0 to 15.
+    pub const fn dlc(&self) -> u8 {
+        self.dlc
+    }
+
+    /// The data bytes, 0 to 64.
+    pub fn data(&self) -> &[u8] {
+        &self.data[..self.data_len()]
+    }
+
+    /// How many data bytes there are.
+    pub const fn data_len(&self) -> usize {
+        FD_LENGTHS[(self.dlc & 15) as usize] as usize
+    }
+}
+
+/// In the text form's one digit of flags, as in Linux's `canfd_frame`: bit rate switch, error passive sender, and that the frame
+/// is an FD one, which it is anyway.
+pub const FLAG_BRS: u8 = 1;
+/// The sender is error passive.
+pub const FLAG_ESI: u8 = 2;
+/// It is an FD frame; kernels differ in whether they set it.
+pub const FLAG_FDF: u8 = 4;
+
+impl FdFrame {
+    /// [`FLAG_BRS`] and [`FLAG_ESI`].
+    pub const fn flags(&self) -> u8 {
+        (if self.brs { FLAG_BRS } else { 0 }) | (if self.esi { FLAG_ESI } else { 0 })
+    }
+}
+
+impl fmt::Display for FdFrame {
+    /// `123##1DEADBEEF`: the digit behind `##` has the flags.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}##{:X}", self.id, self.flags())?;
+        self.data().iter().try_for_each(|byte| write!(f, "{byte:02X}"))
+    }
+}
+
+impl fmt::Debug for FdFrame {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "FdFrame({self})")
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_lengths_that_the_bus_has_a_code_for_make_a_frame() {
+        let id = Id::standard(1).unwrap();
+        for len in 0..=70 {
+            let frame = FdFrame::new(id, true, false, &vec![7; len]);
+            let known = FD_LENGTHS.iter().any(|known| usize::from(*known) == len);
+            assert_eq!(frame.is_some(), known, "{len}");
+            assert!(frame.is_none_or(|frame| frame.data() == vec![7; len]));
+        }
+    }
+}

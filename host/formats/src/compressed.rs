@@ -7,6 +7,7 @@ use std::path::Path;
 /// Compression that leaves a slow machine time to capture: level 1 of 9.
 const GZIP_LEVEL: u32 = 1;
 /// zstd's own default.
+#[cfg(feature = "zstd")]
 const ZSTD_LEVEL: i32 = 3;
 /// Compressed bytes are kept until so many are together or until a flush.
 const COMPRESSED_BYTES: usize = 512 * 1024;
@@ -30,6 +31,13 @@ impl Compression {
     }
 }
 
+/// What a build without zstd says to such a file.
+#[cfg(not(feature = "zstd"))]
+pub(crate) fn without_zstd() -> io::Error {
+    let reason = "this build has no zstd; build it with the feature `zstd`, or use gzip";
+    io::Error::new(io::ErrorKind::Unsupported, reason)
+}
+
 /// A compressed file. A flush ends what gzip calls a member and zstd a frame, and the next bytes begin another: until then
 /// they stay in memory, so that the file is whole whenever this program ends.
 pub(crate) struct Compressed {
@@ -43,13 +51,17 @@ pub(crate) struct Compressed {
 
 enum Encoder {
     Gzip(flate2::write::GzEncoder<Vec<u8>>),
+    #[cfg(feature = "zstd")]
     Zstd(zstd::stream::write::Encoder<'static, Vec<u8>>),
 }
 
 impl Encoder {
     fn new(compression: Compression) -> io::Result<Self> {
         Ok(match compression {
+            #[cfg(feature = "zstd")]
             Compression::Zstd => Self::Zstd(zstd::stream::write::Encoder::new(Vec::new(), ZSTD_LEVEL)?),
+            #[cfg(not(feature = "zstd"))]
+            Compression::Zstd => return Err(without_zstd()),
             Compression::Gzip | Compression::None => {
                 let level = flate2::Compression::new(GZIP_LEVEL);
                 Self::Gzip(flate2::write::GzEncoder::new(Vec::new(), level))
@@ -61,6 +73,7 @@ impl Encoder {
     fn out(&mut self) -> &mut Vec<u8> {
         match self {
             Self::Gzip(encoder) => encoder.get_mut(),
+            #[cfg(feature = "zstd")]
             Self::Zstd(encoder) => encoder.get_mut(),
         }
     }
@@ -77,6 +90,7 @@ impl Compressed {
         self.begun |= !bytes.is_empty();
         match &mut self.encoder {
             Encoder::Gzip(encoder) => encoder.write_all(bytes)?,
+            #[cfg(feature = "zstd")]
             Encoder::Zstd(encoder) => encoder.write_all(bytes)?,
         }
         if self.encoder.out().len() >= COMPRESSED_BYTES { self.take_out() } else { Ok(()) }
@@ -102,6 +116,7 @@ impl Compressed {
         }
         let rest = match std::mem::replace(&mut self.encoder, Encoder::new(self.compression)?) {
             Encoder::Gzip(encoder) => encoder.finish()?,
+            #[cfg(feature = "zstd")]
             Encoder::Zstd(encoder) => encoder.finish()?,
         };
         self.file.write_all(&rest)?;

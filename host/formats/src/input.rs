@@ -112,8 +112,13 @@ impl Input {
             return Self::new(Box::new(decoder), false).without_byte_order_mark();
         }
         if head.starts_with(&[0x28, 0xB5, 0x2F, 0xFD]) {
-            let decoder = zstd::stream::read::Decoder::new(input.into_rest())?;
-            return Self::new(Box::new(decoder), false).without_byte_order_mark();
+            #[cfg(not(feature = "zstd"))]
+            return Err(crate::compressed::without_zstd());
+            #[cfg(feature = "zstd")]
+            {
+                let decoder = zstd::stream::read::Decoder::new(input.into_rest())?;
+                return Self::new(Box::new(decoder), false).without_byte_order_mark();
+            }
         }
         input.without_byte_order_mark()
     }
@@ -290,6 +295,7 @@ mod tests {
         assert_eq!(lines(input("")), []);
     }
 
+    #[cfg(feature = "zstd")]
     #[test]
     fn a_byte_order_mark_is_no_part_of_the_first_line() {
         let text = "\u{feff}a\nb\n";
@@ -299,6 +305,7 @@ mod tests {
         }
     }
 
+    #[cfg(feature = "zstd")]
     #[test]
     fn compressed_files_are_recognised_and_give_all_they_can_when_cut() {
         let text = "0123456789\n".repeat(50_000);

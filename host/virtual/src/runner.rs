@@ -64,6 +64,7 @@ pub(super) enum After {
     /// The port vanishes, as it does when a board enumerates again; whoever opens a virtual device anew gets another one.
     Vanish,
     /// The firmware starts again behind the same port.
+    #[cfg(unix)]
     Restart,
 }
 

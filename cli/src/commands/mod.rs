@@ -14,6 +14,7 @@ pub mod diff;
 pub mod r#gen;
 pub mod info;
 pub mod list;
+pub mod man;
 pub mod monitor;
 pub mod plot;
 pub mod replay;
@@ -54,6 +55,9 @@ pub enum Command {
     Capture(capture::Args),
     /// Print the completion script of a shell.
     Completions(completions::Args),
+    /// Write the manual pages.
+    #[command(hide = true)]
+    Man(man::Args),
     /// Show a trace as signals, by DBC or signal file.
     Decode(decode::Args),
     /// Capture the worst traffic there is, without a board, and check that nothing is lost silently.
@@ -102,6 +106,7 @@ impl Command {
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
             Self::Completions(args) => completions::run(&args, line),
+            Self::Man(args) => man::run(&args, line),
             Self::Decode(args) => decode::run(&args),
             Self::Demo(args) => demo::run(&args),
             Self::Info(args) => info::run(&args),

@@ -1,0 +1,48 @@
+//! The command, and what is generated from its command line.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Result;
+use xshell::{Shell, cmd};
+
+use super::{VERSION, archive, notices, staging};
+use crate::workspace;
+
+/// Shells, and what each calls the file with a command's completions.
+const COMPLETIONS: [(&str, &str); 4] =
+    [("bash", "cantap"), ("zsh", "_cantap"), ("fish", "cantap.fish"), ("powershell", "_cantap.ps1")];
+
+/// Packs the command for this system.
+pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
+    let name = format!("cantap-{VERSION}-{}", cmd!(shell, "rustc --print host-tuple").quiet().read()?);
+    let content = staging(shell, dist, &name)?;
+    let command = build(shell)?;
+    shell.copy_file(&command, &content)?;
+    man_pages(shell, &command, &content.join("man"))?;
+    for (which, file) in COMPLETIONS {
+        let script = completions(shell, &command, which)?;
+        shell.write_file(content.join("completions").join(which).join(file), script)?;
+    }
+    if cfg!(target_os = "linux") {
+        shell.copy_file("packaging/60-cantap.rules", &content)?;
+    }
+    notices::write(shell, &content.join("THIRD-PARTY.txt"), &["-p", "cantap-cli"])?;
+    archive(shell, dist, &name, &content)
+}
+
+/// Builds the command as it is released.
+pub fn build(shell: &Shell) -> Result<PathBuf> {
+    cmd!(shell, "cargo build --locked --release -p cantap-cli").run()?;
+    Ok(workspace::target().join("release").join(format!("cantap{}", std::env::consts::EXE_SUFFIX)))
+}
+
+/// Writes the manual pages into a directory, which is made.
+pub fn man_pages(shell: &Shell, command: &Path, directory: &Path) -> Result<()> {
+    shell.create_dir(directory)?;
+    Ok(cmd!(shell, "{command} man {directory}").quiet().run()?)
+}
+
+/// What a shell needs to complete the command line.
+pub fn completions(shell: &Shell, command: &Path, which: &str) -> Result<String> {
+    Ok(cmd!(shell, "{command} completions {which}").quiet().read()? + "\n")
+}

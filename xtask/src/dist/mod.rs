@@ -1,0 +1,93 @@
+//! `cargo xtask dist`: what a release has, in `target/dist`, named by what it is and its version.
+
+mod command;
+mod deb;
+mod firmware;
+mod notices;
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result};
+use flate2::Compression;
+use flate2::write::GzEncoder;
+use xshell::Shell;
+
+use crate::workspace;
+
+const VERSION: &str = env!("CARGO_PKG_VERSION");
+/// What goes into every archive.
+const PAPERS: [&str; 4] = ["README.md", "CHANGELOG.md", "LICENSE-MIT", "LICENSE-APACHE"];
+
+/// What `cargo xtask dist` takes.
+#[derive(clap::Args)]
+pub struct Args {
+    /// What to make; everything without it.
+    what: Vec<What>,
+}
+
+/// A part of a release.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum What {
+    /// The command with manual pages and completions, for this system.
+    Command,
+    /// The same as Debian's package, with the udev rule.
+    Deb,
+    /// An archive for each board: ELF, and the image for `dfu-util`.
+    Firmware,
+}
+
+/// Builds and packs.
+pub fn run(args: &Args) -> Result<()> {
+    use clap::ValueEnum;
+
+    let shell = workspace::shell()?;
+    let dist = workspace::target().join("dist");
+    shell.create_dir(&dist)?;
+    for what in if args.what.is_empty() { What::value_variants() } else { &args.what } {
+        match what {
+            What::Command => command::pack(&shell, &dist)?,
+            What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is no Linux"),
+            What::Deb => deb::pack(&shell, &dist)?,
+            What::Firmware => firmware::pack(&shell, &dist)?,
+        }
+    }
+    Ok(())
+}
+
+/// Packs what is in a directory, and the papers, into `DIST/NAME.tar.gz`, under a directory `NAME`.
+fn archive(shell: &Shell, dist: &Path, name: &str, content: &Path) -> Result<()> {
+    for paper in PAPERS {
+        shell.copy_file(paper, content)?;
+    }
+    let path = dist.join(format!("{name}.tar.gz"));
+    let mut tar = tar::Builder::new(GzEncoder::new(std::fs::File::create(&path)?, Compression::best()));
+    tar.mode(tar::HeaderMode::Deterministic);
+    for file in files_under(shell, content)? {
+        let inside = Path::new(name).join(file.strip_prefix(content)?);
+        tar.append_path_with_name(&file, inside).with_context(|| file.display().to_string())?;
+    }
+    tar.into_inner()?.finish()?;
+    println!("{}", path.display());
+    Ok(())
+}
+
+/// Every file, in an order that does not depend on the file system.
+fn files_under(shell: &Shell, directory: &Path) -> Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    for path in shell.read_dir(directory)? {
+        if path.is_dir() {
+            files.extend(files_under(shell, &path)?);
+        } else {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+/// An empty directory to put a package's files together in.
+fn staging(shell: &Shell, dist: &Path, name: &str) -> Result<PathBuf> {
+    let staging = dist.join("staging").join(name);
+    shell.remove_path(&staging)?;
+    Ok(shell.create_dir(&staging)?)
+}

@@ -5,9 +5,9 @@ use anyhow::{Result, bail, ensure};
 use xshell::{Shell, cmd};
 
 use crate::board::Board;
-use crate::peers::is_installed;
-use crate::test::Outcome;
-use crate::{toolchain, workspace};
+use crate::outcome::Outcome;
+use crate::toolchain::{self, is_installed};
+use crate::workspace;
 
 /// What the scripts need on Debian: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 5] = [
@@ -29,7 +29,8 @@ pub fn run(shell: &Shell) -> Result<Outcome> {
     if let Err(reason) = install_missing(shell) {
         return skip(reason);
     }
-    cmd!(shell, "cargo build --locked -p cantap-cli -p cantap-sim").run()?;
+    // The programs that the tests' build makes, too: another selection of packages would compile everything once more.
+    crate::tests::build(shell)?;
     let programs = workspace::target().join("debug");
     let (cantap, simulator) = (programs.join("cantap"), programs.join("cantap-sim"));
     let cache = workspace::target().join("kernel");

@@ -6,15 +6,24 @@
 
 mod bench;
 mod board;
+mod compiler;
+mod cross;
+mod dependencies;
 mod dist;
+mod features;
 mod firmware;
 mod kernel;
+mod metadata;
+mod outcome;
+mod package;
 mod peers;
 mod reproducible;
 mod size;
 mod soak;
 mod test;
+mod tests;
 mod toolchain;
+mod typos;
 mod workspace;
 
 use std::process::ExitCode;
@@ -41,8 +50,8 @@ enum Task {
     Bench(bench::Args),
     /// Runs the firmware on the emulated board for a long time, with a new seed for each run.
     Soak(soak::Args),
-    /// Packs the release archives: the command, and each board's firmware.
-    Dist,
+    /// Packs what a release has: the command, Debian's package, each board's firmware.
+    Dist(dist::Args),
 }
 
 fn main() -> ExitCode {
@@ -52,7 +61,7 @@ fn main() -> ExitCode {
         Task::Size => size::run(),
         Task::Bench(args) => bench::run(&args),
         Task::Soak(args) => soak::run(&args),
-        Task::Dist => dist::run(),
+        Task::Dist(args) => dist::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,17 +1,17 @@
-//! Other people's programs that the tests compare ours with: can-utils, tshark, python-can, cantools.
+//! Other people's programs: those that the tests compare ours with (can-utils, tshark, python-can, cantools), and the spelling checker.
 
 use std::path::PathBuf;
 
 use anyhow::Result;
 use xshell::{Shell, cmd};
 
-use crate::toolchain;
+use crate::toolchain::{self, is_installed};
 use crate::workspace;
 
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
-/// Python packages, each named as pip and as `import` want it.
-const MODULES: [(&str, &str); 3] = [("python-can", "can"), ("pyserial", "serial"), ("cantools", "cantools")];
+/// Python packages, with their versions.
+const REQUIREMENTS: &str = "xtask/peers.txt";
 
 /// Where the peers are.
 pub struct Peers {
@@ -38,27 +38,27 @@ impl Peers {
             }
             toolchain::install(shell, &missing)?;
         }
-        let venv = workspace::target().join("peers");
-        let python = venv.join("bin/python");
-        let imports: Vec<&str> = MODULES.iter().map(|(_, module)| *module).collect();
-        let imports = format!("import {}", imports.join(", "));
-        if cmd!(shell, "{python} -c {imports}").quiet().ignore_stderr().run().is_err() {
-            let packages = MODULES.map(|(package, _)| package);
-            // Debian has what a venv needs in a package of its own.
-            if cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_err()
-                && toolchain::can_install()
-            {
-                toolchain::install(shell, &["python3-venv"])?;
-            }
-            cmd!(shell, "python3 -m venv --clear {venv}").run()?;
-            cmd!(shell, "{python} -m pip install --quiet --retries 10 {packages...}").run()?;
-        }
-        Ok(Some(Peers { python }))
+        Ok(Some(Peers { python: venv(shell)?.join("bin/python") }))
     }
 }
 
-/// Whether a program is on the path.
-pub fn is_installed(program: &str) -> bool {
-    let path = std::env::var_os("PATH").unwrap_or_default();
-    std::env::split_paths(&path).any(|dir| dir.join(program).is_file())
+/// A Python environment with the packages of `peers.txt`, made anew where that file has changed.
+pub fn venv(shell: &Shell) -> Result<PathBuf> {
+    let venv = workspace::target().join("peers");
+    let installed = venv.join("installed.txt");
+    let wanted = shell.read_file(REQUIREMENTS)?;
+    if shell.read_file(&installed).is_ok_and(|text| text == wanted) {
+        return Ok(venv);
+    }
+    // Debian has what a venv needs in a package of its own.
+    if cmd!(shell, "python3 -c 'import ensurepip'").quiet().ignore_stderr().run().is_err()
+        && toolchain::can_install()
+    {
+        toolchain::install(shell, &["python3-venv"])?;
+    }
+    cmd!(shell, "python3 -m venv --clear {venv}").run()?;
+    let python = venv.join("bin/python");
+    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {REQUIREMENTS}").run()?;
+    shell.write_file(installed, wanted)?;
+    Ok(venv)
 }

@@ -2,13 +2,17 @@
 
 use std::time::{Duration, Instant};
 
-use anyhow::{Result, ensure};
-use xshell::{Cmd, Shell, cmd};
+use anyhow::Result;
+use xshell::{Shell, cmd};
 
 use crate::board::Board;
+use crate::outcome::Outcome;
 use crate::peers::Peers;
 use crate::toolchain::Toolchain;
-use crate::{firmware, kernel, reproducible, size, workspace};
+use crate::{
+    compiler, cross, dependencies, features, firmware, kernel, package, reproducible, size, tests, typos,
+    workspace,
+};
 
 /// What `cargo xtask test` takes.
 #[derive(clap::Args)]
@@ -18,53 +22,46 @@ pub struct Args {
     only: Vec<Step>,
 }
 
-/// One thing that is checked. The order is the order of the run: what fails fast comes first.
+/// One thing that is checked. The order is the order of the run: what fails fast comes first, what takes long last.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
 enum Step {
     /// Formatting.
     Fmt,
+    /// Spelling.
+    Typos,
+    /// Other people's crates: licences, duplicates, sources.
+    Dependencies,
+    /// The compiler is the oldest that the packages promise to build with, or that one is tried.
+    OldestCompiler,
+    /// Lints of everything for the host.
+    Clippy,
+    /// Each crate without features, and with each one alone.
+    Features,
+    /// The fuzz targets compile.
+    Fuzz,
+    /// Public items' documentation, with every link checked.
+    Doc,
+    /// The libraries without ports and threads compile for WebAssembly.
+    Wasm,
+    /// Windows and macOS, as far as they can be compiled for here.
+    Systems,
     /// The firmware of every board.
     Firmware,
     /// What the firmware takes, against its budget.
     Size,
-    /// A second build, elsewhere, gives the same bytes.
-    Reproducible,
-    /// Lints of everything for the host.
-    Clippy,
     /// Lints of the firmware for each board.
     ClippyFirmware,
-    /// The tests that need no firmware ELF.
-    Host,
-    /// The tests that run the firmware ELF on the emulated board.
-    Emulated,
+    /// A second build, elsewhere, gives the same bytes.
+    Reproducible,
+    /// Every test, those that run the firmware's ELF on the emulated board included.
+    Tests,
     /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
     Kernel,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
-    /// Public items' documentation, with every link checked.
-    Doc,
-    /// The library crates as they would be published: each packs.
+    /// The crates as they would be published: each packs, and builds from its package.
     Package,
 }
-
-/// How a step ended that did not fail.
-pub enum Outcome {
-    /// All of it ran.
-    Passed,
-    /// It could not run here, for this reason.
-    Skipped(String),
-}
-
-/// What can be published, each behind what it needs.
-const PUBLISHED: [&str; 7] = [
-    "cantap-can",
-    "cantap-wire",
-    "cantap-trace",
-    "cantap-formats",
-    "cantap-signals",
-    "cantap-analysis",
-    "cantap",
-];
 
 /// Runs the steps one after the other and stops at the first that fails.
 pub fn run(args: &Args) -> Result<()> {
@@ -97,45 +94,37 @@ impl Step {
     fn run(self, shell: &Shell, toolchain: Toolchain, peers: Option<&Peers>) -> Result<Outcome> {
         match self {
             Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
-            Step::Firmware => firmware::build_all(shell, toolchain, &Board::ALL)?,
-            Step::Size => size::run()?,
-            Step::Reproducible => reproducible::check(shell, toolchain)?,
+            Step::Typos => return typos::check(shell),
+            Step::Dependencies => dependencies::check(shell)?,
+            Step::OldestCompiler => return compiler::check(shell),
             Step::Clippy => {
                 cmd!(shell, "cargo clippy --locked --workspace --all-targets --all-features -- -D warnings")
                     .run()?;
             }
-            Step::ClippyFirmware => firmware::clippy(shell, toolchain)?,
-            Step::Host => {
-                let test = cmd!(shell, "cargo test --locked --workspace --all-features --exclude cantap-sim");
-                with_peers(test, peers).run()?;
+            Step::Features => features::check(shell)?,
+            Step::Fuzz => {
+                let target = workspace::target().join("fuzz");
+                // A workspace of its own, but with everybody's versions.
+                shell.copy_file("Cargo.lock", "fuzz/Cargo.lock")?;
+                cmd!(shell, "cargo check --manifest-path fuzz/Cargo.toml --target-dir {target}").run()?;
             }
-            Step::Emulated => {
-                let elf = Board::ALL[0].elf();
-                ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
-                let test = cmd!(shell, "cargo test --locked -p cantap-sim --all-features");
-                with_peers(test, peers).env("CANTAP_FIRMWARE_ELF", elf).run()?;
-            }
-            Step::Kernel => return kernel::run(shell),
-            Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
             Step::Doc => {
                 cmd!(shell, "cargo doc --locked --workspace --lib --no-deps --all-features")
                     .env("RUSTDOCFLAGS", "-D warnings")
                     .run()?;
             }
-            Step::Package => {
-                let packages = PUBLISHED.iter().flat_map(|name| ["-p", name]);
-                cmd!(shell, "cargo package --locked --allow-dirty --no-verify {packages...}").run()?;
-            }
+            Step::Wasm => return cross::check(shell, toolchain, cross::WASM),
+            Step::Systems => return cross::check(shell, toolchain, cross::SYSTEMS),
+            Step::Firmware => firmware::build_all(shell, toolchain, &Board::ALL)?,
+            Step::Size => size::run()?,
+            Step::ClippyFirmware => firmware::clippy(shell, toolchain)?,
+            Step::Reproducible => reproducible::check(shell, toolchain)?,
+            Step::Tests => tests::run(shell, peers)?,
+            Step::Kernel => return kernel::run(shell),
+            Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
+            Step::Package => package::check(shell)?,
         }
         Ok(Outcome::Passed)
-    }
-}
-
-/// Tells the tests where the peers are and that they must not skip them.
-fn with_peers<'a>(cmd: Cmd<'a>, peers: Option<&Peers>) -> Cmd<'a> {
-    match peers {
-        Some(peers) => cmd.env("CANTAP_PYTHON", &peers.python).env("CANTAP_REQUIRE_PEERS", "1"),
-        None => cmd,
     }
 }
 

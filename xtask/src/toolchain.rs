@@ -32,7 +32,7 @@ pub enum Toolchain {
 impl Toolchain {
     /// The toolchain that is here.
     pub fn find(shell: &Shell) -> Result<Self> {
-        if sysroot(shell, "rustc")?.join("lib/rustlib").join(TARGET).join("lib").is_dir() {
+        if has_std(shell, TARGET)? {
             return Ok(Toolchain::Rustup);
         }
         let tools = [DEBIAN_CARGO, DEBIAN_RUSTC, DEBIAN_LINKER, DEBIAN_CLIPPY];
@@ -63,17 +63,39 @@ impl Toolchain {
 
     /// `cargo SUBCOMMAND` for the chip. Paths of this machine do not get into what it builds.
     pub fn cargo<'a>(self, shell: &'a Shell, subcommand: &str, target_dir: &Path) -> Result<Cmd<'a>> {
-        let (cargo, rustc) = match self {
-            Toolchain::Rustup => ("cargo", "rustc"),
-            Toolchain::Debian => (DEBIAN_CARGO, DEBIAN_RUSTC),
+        let flags = remaps(shell, &sysroot(shell, self.rustc())?)?;
+        Ok(self
+            .cargo_for(shell, subcommand, TARGET, "core", target_dir)?
+            .env("CARGO_ENCODED_RUSTFLAGS", flags))
+    }
+
+    /// The way to check for a target with a standard library, of which rustup's is the first choice; `None` without one.
+    pub fn with_std(self, shell: &Shell, target: &str) -> Result<Option<Self>> {
+        if has_std(shell, target)? {
+            return Ok(Some(Toolchain::Rustup));
+        }
+        Ok((self == Toolchain::Debian).then_some(self))
+    }
+
+    /// `cargo SUBCOMMAND` for a target; `parts` are those of the standard library that are built where there is none.
+    pub fn cargo_for<'a>(
+        self,
+        shell: &'a Shell,
+        subcommand: &str,
+        target: &str,
+        parts: &str,
+        target_dir: &Path,
+    ) -> Result<Cmd<'a>> {
+        let cargo = match self {
+            Toolchain::Rustup => "cargo",
+            Toolchain::Debian => DEBIAN_CARGO,
         };
         let mut cmd =
-            cmd!(shell, "{cargo} {subcommand} --locked --target {TARGET} --target-dir {target_dir}")
-                .env("CARGO_ENCODED_RUSTFLAGS", remaps(shell, &sysroot(shell, rustc)?)?);
+            cmd!(shell, "{cargo} {subcommand} --locked --target {target} --target-dir {target_dir}");
         if self == Toolchain::Debian {
-            // Unstable only in name: it lets the packaged stable compiler build `core`.
+            // Unstable only in name: it lets the packaged stable compiler build its own library.
             cmd = cmd
-                .arg("-Zbuild-std=core")
+                .arg(format!("-Zbuild-std={parts}"))
                 .env("RUSTC", DEBIAN_RUSTC)
                 .env("RUSTC_BOOTSTRAP", "1")
                 // `cargo clippy` takes the first cargo-clippy of the path, which must be of the same compiler.
@@ -83,6 +105,13 @@ impl Toolchain {
                 .env_remove("RUSTC_WRAPPER");
         }
         Ok(cmd)
+    }
+
+    const fn rustc(self) -> &'static str {
+        match self {
+            Toolchain::Rustup => "rustc",
+            Toolchain::Debian => DEBIAN_RUSTC,
+        }
     }
 }
 
@@ -98,6 +127,12 @@ pub fn can_install() -> bool {
     is_root && Path::new("/etc/debian_version").exists()
 }
 
+/// Whether a program is on the path.
+pub fn is_installed(program: &str) -> bool {
+    let path = std::env::var_os("PATH").unwrap_or_default();
+    std::env::split_paths(&path).any(|dir| dir.join(program).is_file())
+}
+
 /// Installs Debian packages.
 pub fn install(shell: &Shell, packages: &[&str]) -> Result<()> {
     cmd!(shell, "apt-get -q -o Acquire::Retries=3 update").env("DEBIAN_FRONTEND", "noninteractive").run()?;
@@ -105,6 +140,11 @@ pub fn install(shell: &Shell, packages: &[&str]) -> Result<()> {
         .env("DEBIAN_FRONTEND", "noninteractive")
         .run()?;
     Ok(())
+}
+
+/// Whether the toolchain that builds everything else has a target's standard library.
+fn has_std(shell: &Shell, target: &str) -> Result<bool> {
+    Ok(sysroot(shell, "rustc")?.join("lib/rustlib").join(target).join("lib").is_dir())
 }
 
 fn sysroot(shell: &Shell, rustc: &str) -> Result<PathBuf> {

@@ -1,0 +1,87 @@
+//! What compiles for targets that are not this machine: the libraries without ports and threads for WebAssembly, and as much for
+//! Windows and macOS as needs no C compiler of theirs. Compiled, not linked and not run: that is hosted CI's.
+
+use anyhow::Result;
+use xshell::Shell;
+
+use crate::outcome::Outcome;
+use crate::toolchain::{self, Toolchain};
+use crate::workspace;
+
+/// A target, and what is checked for it.
+pub struct Check {
+    target: &'static str,
+    /// What cargo is given.
+    arguments: &'static [&'static str],
+    /// A program that compiling its standard library takes, and Debian's package with it.
+    needs: Option<(&'static str, &'static str)>,
+}
+
+/// Libraries that neither open ports nor start threads.
+pub const WASM: &[Check] = &[Check {
+    target: "wasm32-unknown-unknown",
+    arguments: &[
+        "-p",
+        "cantap-can",
+        "-p",
+        "cantap-wire",
+        "-p",
+        "cantap-trace",
+        "-p",
+        "cantap-formats",
+        "-p",
+        "cantap-signals",
+        "-p",
+        "cantap-analysis",
+        "--no-default-features",
+        "--features",
+        "cantap-analysis/plot",
+    ],
+    needs: None,
+}];
+
+/// On Windows the whole command but zstd, which is C. For macOS, signals are missing, too: their parser's stack guard is assembly.
+pub const SYSTEMS: &[Check] = &[
+    Check {
+        target: "x86_64-pc-windows-gnu",
+        arguments: &["-p", "cantap-cli", "--no-default-features", "--features", "emu"],
+        needs: Some(("x86_64-w64-mingw32-dlltool", "binutils-mingw-w64-x86-64")),
+    },
+    Check {
+        target: "aarch64-apple-darwin",
+        arguments: &[
+            "-p",
+            "cantap",
+            "-p",
+            "cantap-formats",
+            "--no-default-features",
+            "--features",
+            "cantap/serial",
+        ],
+        needs: None,
+    },
+];
+
+/// Compiles them, for each target that there is a standard library for.
+pub fn check(shell: &Shell, toolchain: Toolchain, checks: &[Check]) -> Result<Outcome> {
+    let mut skipped = Vec::new();
+    for Check { target, arguments, needs } in checks {
+        let Some(toolchain) = toolchain.with_std(shell, target)? else {
+            skipped.push(format!("no standard library for {target}; run `rustup target add {target}`"));
+            continue;
+        };
+        if let Some((program, package)) = needs.filter(|(program, _)| !toolchain::is_installed(program)) {
+            if !toolchain::can_install() {
+                skipped.push(format!("{target} needs {program}; on Debian run `apt-get install {package}`"));
+                continue;
+            }
+            toolchain::install(shell, &[package])?;
+        }
+        let target_dir = workspace::target().join("cross");
+        toolchain
+            .cargo_for(shell, "check", target, "std,panic_abort", &target_dir)?
+            .args(*arguments)
+            .run()?;
+    }
+    Ok(if skipped.is_empty() { Outcome::Passed } else { Outcome::Skipped(skipped.join("; ")) })
+}

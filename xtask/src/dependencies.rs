@@ -1,0 +1,139 @@
+//! Other people's crates, held to `deny.toml`: licences that may be in what we publish, no crate twice without a reason, no sources
+//! but the registry.
+//!
+//! cargo-deny, which reads the same file, does this in hosted CI and knows the advisories as well. It is not built here: it has some 300
+//! dependencies of its own.
+
+use std::collections::{BTreeMap, BTreeSet};
+
+use anyhow::{Context, Result, ensure};
+use serde::Deserialize;
+use spdx::{Expression, LicenseReq, ParseMode};
+use xshell::Shell;
+
+use crate::metadata::{Metadata, Package};
+
+/// What of `deny.toml` is checked here.
+#[derive(Deserialize)]
+struct Rules {
+    licenses: Licences,
+    bans: Bans,
+}
+
+#[derive(Deserialize)]
+struct Licences {
+    allow: Vec<String>,
+}
+
+#[derive(Deserialize)]
+struct Bans {
+    skip: Vec<Skip>,
+}
+
+/// A version of a crate that may be there beside another.
+#[derive(Deserialize)]
+struct Skip {
+    #[serde(rename = "crate")]
+    name_and_version: String,
+}
+
+/// Checks all of them and names every fault.
+pub fn check(shell: &Shell) -> Result<()> {
+    let rules: Rules = toml::from_str(&shell.read_file("deny.toml")?).context("deny.toml")?;
+    let metadata = Metadata::read(shell)?;
+    let others: Vec<&Package> = metadata.others().collect();
+    let faults: Vec<String> = licences(&others, &rules.licenses.allow)
+        .chain(duplicates(&others, &rules.bans.skip))
+        .chain(sources(&others))
+        .collect();
+    ensure!(faults.is_empty(), "against deny.toml:\n{}", faults.join("\n"));
+    println!("{} crates of others: licences, versions and sources are as deny.toml allows", others.len());
+    Ok(())
+}
+
+fn licences<'a>(others: &'a [&Package], allowed: &'a [String]) -> impl Iterator<Item = String> + 'a {
+    others.iter().filter_map(move |package| {
+        let Package { name, version, .. } = package;
+        let Some(text) = &package.license else { return Some(format!("{name} {version} names no licence")) };
+        // Older crates write `/` for OR.
+        match Expression::parse_mode(text, ParseMode::LAX) {
+            Err(error) => Some(format!("{name} {version} has a licence that is no SPDX expression: {error}")),
+            Ok(expression) if expression.evaluate(|licence| is_allowed(licence, allowed)) => None,
+            Ok(_) => Some(format!("{name} {version} is under {text}, which is not allowed")),
+        }
+    })
+}
+
+fn is_allowed(licence: &LicenseReq, allowed: &[String]) -> bool {
+    allowed.contains(&licence.to_string())
+}
+
+/// Crates that are there in several versions, of which not all but one are excused; and excuses that nothing needs any more.
+fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String> {
+    let excused: BTreeSet<&str> = skip.iter().map(|skip| skip.name_and_version.as_str()).collect();
+    let mut versions: BTreeMap<&str, Vec<String>> = BTreeMap::new();
+    for package in others {
+        versions.entry(&package.name).or_default().push(format!("{}@{}", package.name, package.version));
+    }
+    let mut faults = Vec::new();
+    let mut needed = BTreeSet::new();
+    for (name, versions) in versions.iter().filter(|(_, versions)| versions.len() > 1) {
+        let open = versions.iter().filter(|version| !excused.contains(version.as_str())).count();
+        if open > 1 {
+            faults.push(format!("{name} is there {} times: {}", versions.len(), versions.join(", ")));
+        }
+        needed.extend(versions.iter().cloned());
+    }
+    faults.extend(
+        excused
+            .iter()
+            .filter(|excuse| !needed.contains(**excuse))
+            .map(|excuse| format!("{excuse} needs no excuse any more")),
+    );
+    faults.into_iter()
+}
+
+fn sources<'a>(others: &'a [&Package]) -> impl Iterator<Item = String> + 'a {
+    others.iter().filter_map(|package| {
+        let from_registry = package.source.as_deref().is_some_and(|source| source.starts_with("registry+"));
+        (!from_registry)
+            .then(|| format!("{} {} does not come from the registry", package.name, package.version))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn package(name: &str, version: &str, license: &str) -> Package {
+        let text = format!(
+            r#"{{"id": "{name}", "name": "{name}", "version": "{version}", "license": "{license}", "features": {{}},
+            "manifest_path": "", "publish": null, "source": "registry+a", "repository": null}}"#
+        );
+        serde_json::from_str(&text).unwrap()
+    }
+
+    fn faults_of(license: &str) -> Vec<String> {
+        let package = package("a", "1.0.0", license);
+        licences(&[&package], &["MIT".to_owned(), "Apache-2.0 WITH LLVM-exception".to_owned()]).collect()
+    }
+
+    #[test]
+    fn a_licence_is_allowed_where_each_part_that_must_hold_is() {
+        for good in ["MIT", "GPL-3.0-only OR MIT", "MIT/Apache-2.0", "Apache-2.0 WITH LLVM-exception"] {
+            assert_eq!(faults_of(good), Vec::<String>::new(), "{good}");
+        }
+        for bad in ["GPL-3.0-only", "MIT AND BSD-3-Clause", "Apache-2.0", "as you like"] {
+            assert_eq!(faults_of(bad).len(), 1, "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_second_version_needs_an_excuse_and_an_excuse_needs_a_second_version() {
+        let (old, new) = (package("a", "1.0.0", "MIT"), package("a", "2.0.0", "MIT"));
+        let excuse = |text: &str| Skip { name_and_version: text.to_owned() };
+        assert_eq!(duplicates(&[&old, &new], &[]).count(), 1);
+        assert_eq!(duplicates(&[&old, &new], &[excuse("a@1.0.0")]).count(), 0);
+        assert_eq!(duplicates(&[&new], &[excuse("a@1.0.0")]).count(), 1);
+    }
+}

@@ -1,0 +1,63 @@
+//! What cargo knows of the workspace and of everything in its lock file.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+
+use anyhow::{Context, Result};
+use serde::Deserialize;
+use xshell::{Shell, cmd};
+
+/// What `cargo metadata` says, as far as it is used here.
+#[derive(Deserialize)]
+pub struct Metadata {
+    /// Our own packages and everybody else's.
+    pub packages: Vec<Package>,
+    workspace_members: Vec<String>,
+}
+
+/// A package.
+#[derive(Deserialize)]
+pub struct Package {
+    id: String,
+    /// Its name.
+    pub name: String,
+    /// Its version.
+    pub version: String,
+    /// Its licence, as an SPDX expression.
+    pub license: Option<String>,
+    /// Its features, and what each turns on.
+    pub features: BTreeMap<String, Vec<String>>,
+    /// Where its source is.
+    pub manifest_path: PathBuf,
+    /// Empty where it may not be published.
+    publish: Option<Vec<String>>,
+    /// Where it comes from; nothing for our own.
+    pub source: Option<String>,
+    /// Its page.
+    pub repository: Option<String>,
+}
+
+impl Metadata {
+    /// Asks cargo, for all targets and with all features.
+    pub fn read(shell: &Shell) -> Result<Self> {
+        let text = cmd!(shell, "cargo metadata --locked --format-version 1 --all-features").quiet().read()?;
+        serde_json::from_str(&text).context("cargo metadata")
+    }
+
+    /// The packages of this repository.
+    pub fn members(&self) -> impl Iterator<Item = &Package> {
+        self.packages.iter().filter(|package| self.workspace_members.contains(&package.id))
+    }
+
+    /// The packages of others.
+    pub fn others(&self) -> impl Iterator<Item = &Package> {
+        self.packages.iter().filter(|package| !self.workspace_members.contains(&package.id))
+    }
+}
+
+impl Package {
+    /// Whether it can be published.
+    pub fn is_published(&self) -> bool {
+        self.publish.as_ref().is_none_or(|registries| !registries.is_empty())
+    }
+}

@@ -1,0 +1,32 @@
+//! The crates as they would be published: each packs, with the licences' own texts, and the command builds from the packages alone.
+
+use anyhow::{Context, Result, ensure};
+use xshell::{Shell, cmd};
+
+use crate::metadata::{Metadata, Package};
+
+/// Packs what can be published and builds each package from its archive, with the others of them in place of the registry's.
+pub fn check(shell: &Shell) -> Result<()> {
+    let metadata = Metadata::read(shell)?;
+    let published: Vec<&Package> = metadata.members().filter(|package| package.is_published()).collect();
+    for package in &published {
+        licences(shell, package)?;
+    }
+    let packages = published.iter().flat_map(|package| ["-p", &package.name]);
+    cmd!(shell, "cargo package --locked --allow-dirty {packages...}").run()?;
+    Ok(())
+}
+
+/// A package has its own copies: a link would be a file with a path in it wherever links are not kept.
+fn licences(shell: &Shell, package: &Package) -> Result<()> {
+    let directory = package.manifest_path.parent().context("a manifest lies in no directory")?;
+    for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
+        let own = shell.read_file(directory.join(licence)).with_context(|| package.name.clone())?;
+        ensure!(
+            own == shell.read_file(licence)?,
+            "{}'s {licence} is not the workspace's: copy it",
+            package.name
+        );
+    }
+    Ok(())
+}

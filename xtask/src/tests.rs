@@ -1,0 +1,30 @@
+//! Every test of the workspace, in one build.
+//!
+//! One selection of packages and features for all of them: cargo unifies features over what it builds at once, and any other selection
+//! would compile the same crates again with others.
+
+use anyhow::{Result, ensure};
+use xshell::{Cmd, Shell, cmd};
+
+use crate::board::Board;
+use crate::peers::Peers;
+
+/// Compiles the tests, and with them the programs that they run (`cantap`, `cantap-sim`).
+pub fn build(shell: &Shell) -> Result<()> {
+    Ok(cargo_test(shell)?.arg("--no-run").run()?)
+}
+
+/// Runs them, those on the emulated board with the default board's firmware. With peers, they must not skip one.
+pub fn run(shell: &Shell, peers: Option<&Peers>) -> Result<()> {
+    let mut test = cargo_test(shell)?;
+    if let Some(peers) = peers {
+        test = test.env("CANTAP_PYTHON", &peers.python).env("CANTAP_REQUIRE_PEERS", "1");
+    }
+    Ok(test.run()?)
+}
+
+fn cargo_test(shell: &Shell) -> Result<Cmd<'_>> {
+    let elf = Board::ALL[0].elf();
+    ensure!(elf.exists(), "there is no {}; run `cargo xtask firmware`", elf.display());
+    Ok(cmd!(shell, "cargo test --locked --workspace --all-features").env("CANTAP_FIRMWARE_ELF", elf))
+}

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
-use cantap_signals::{Decoder, Selection, Source};
+use cantap_signals::{Database, Decoder, Override, Selection, Source};
 
 /// Which databases; for commands to flatten into theirs.
 #[derive(clap::Args)]
@@ -49,24 +49,32 @@ impl DatabaseArgs {
         self.databases.is_empty()
     }
 
-    /// Loads the databases. Warnings go to standard error; with `strict` they are errors.
-    pub fn load(&self, strict: bool) -> anyhow::Result<Decoder> {
+    /// Loads the databases. Warnings go to standard error, unless `quiet`; with `strict` they are errors.
+    pub fn load(&self, strict: bool, quiet: bool) -> anyhow::Result<Decoder> {
         let mut sources = Vec::new();
         for DatabasePath { channel, path } in &self.databases {
             let database = cantap_signals::load(path)?;
-            for warning in &database.warnings {
-                eprintln!("cantap: {}: {warning}", database.file);
+            if !quiet || strict {
+                warn(&database);
             }
             if strict && !database.warnings.is_empty() {
                 bail!("{} has faults; see above", database.file);
             }
             sources.push(Source { channel: *channel, database });
         }
+        let decoder = self.decoder(sources);
+        if !quiet {
+            overrides(&decoder).for_each(|text| eprintln!("cantap: {text}"));
+        }
+        Ok(decoder)
+    }
+
+    fn decoder(&self, sources: Vec<Source>) -> Decoder {
         let mut decoder = Decoder::new(sources);
         if self.j1939 {
             decoder.assume_j1939();
         }
-        Ok(decoder)
+        decoder
     }
 
     /// Loads what can be loaded, and `further` databases; what is wrong goes to `complaints`. For programs that
@@ -90,19 +98,44 @@ impl DatabaseArgs {
                 Err(error) => complaints.push(error.to_string()),
             }
         }
-        let mut decoder = Decoder::new(sources);
-        if self.j1939 {
-            decoder.assume_j1939();
-        }
+        let decoder = self.decoder(sources);
+        complaints.extend(overrides(&decoder));
         decoder
     }
 
     /// As [`Self::load`], for commands that are useless without a database.
-    pub fn load_some(&self, strict: bool, patterns: &[String]) -> anyhow::Result<Decoder> {
-        let mut decoder = self.load(strict)?;
+    pub fn load_some(&self, strict: bool, quiet: bool, patterns: &[String]) -> anyhow::Result<Decoder> {
+        let mut decoder = self.load(strict, quiet)?;
         decoder.select(&Selection::new(patterns)?).context("--signal")?;
         Ok(decoder)
     }
+}
+
+/// Says what is wrong with a database that can be used.
+fn warn(database: &Database) {
+    /// More would scroll the results of the command off the screen.
+    const SHOWN: usize = 10;
+    for warning in database.warnings.iter().take(SHOWN) {
+        eprintln!("cantap: {}: {warning}", database.file);
+    }
+    let more = database.warnings.len().saturating_sub(SHOWN);
+    if more > 0 {
+        let file = &database.file;
+        eprintln!(
+            "cantap: {file}: and {more} more warnings; `cantap db {file} --warnings` lists all, --quiet hides them"
+        );
+    }
+}
+
+/// Which databases replace messages of others, a sentence each.
+fn overrides(decoder: &Decoder) -> impl Iterator<Item = String> {
+    decoder.overrides().iter().map(|Override { file, by, messages }| {
+        let count = messages.len();
+        let s = if count == 1 { "" } else { "s" };
+        let first = messages.first().map_or("", String::as_str);
+        let such_as = if count == 1 { "" } else { "such as " };
+        format!("{by} replaces {count} message{s} of {file} with the same identifier{s}, {such_as}{first}")
+    })
 }
 
 #[cfg(test)]

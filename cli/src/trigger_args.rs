@@ -33,7 +33,7 @@ impl TriggerArgs {
     /// The trigger, if one was asked for.
     pub fn trigger(&self) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
-        let decoder = self.databases.load(false)?;
+        let decoder = self.databases.load(false, false)?;
         let condition = Condition::new(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =

@@ -102,3 +102,95 @@ fn what_is_wrong_is_named_and_ends_with_1() {
         assert!(err.contains(expected), "{arguments:?}: {err}");
     }
 }
+
+const TRUCK: &str = "BO_ 2364539904 EEC1: 8 A\n SG_ Speed : 24|16@1+ (0.125,0) [0|8031.875] \"rpm\" A\n \
+                     SG_ Gear : 0|4@1+ (1,0) [0|0] \"\" A\nVAL_ 2364539904 Gear 3 \"Drive\" ;\n\
+                     BA_DEF_ BO_ \"VFrameFormat\" ENUM \"StandardCAN\",\"ExtendedCAN\",\"J1939PG\";\n\
+                     BA_ \"VFrameFormat\" BO_ 2364539904 2;\n";
+
+const TRUCK_TRACE: &str = "(1.000000) can0 0CF00400#03FFFF4038\n(1.100000) can0 0CF00400#03FFFFFFFF\n\
+                           (1.200000) can0 0CF00400#03FFFF0038\n(61.200000) can0 0CF00400#03FFFF0138\n";
+
+fn truck(test: &str) {
+    let directory = directory(test);
+    std::fs::write(directory.join("truck.dbc"), TRUCK).unwrap();
+    std::fs::write(directory.join("truck.log"), TRUCK_TRACE).unwrap();
+}
+
+/// 8191.875 rpm is what 0xFFFF would be; J1939 says that there is no value.
+#[test]
+fn what_is_not_available_is_told_as_such() {
+    truck("available");
+    let decode = |more: &[&str]| {
+        let (code, out, err) =
+            cantap("available", &[&["decode", "--db", "truck.dbc", "truck.log"], more].concat());
+        assert_eq!(code, Some(0), "{err}");
+        out.lines().take(2).map(str::to_owned).collect::<Vec<_>>()
+    };
+    assert_eq!(
+        decode(&[]),
+        [
+            "(1.000000) can0 0CF00400 EEC1: Speed = 1800 rpm, Gear = 3 (Drive)",
+            "(1.100000) can0 0CF00400 EEC1: Speed = not available, Gear = 3 (Drive)"
+        ]
+    );
+    assert!(decode(&["--json"])[1].ends_with("\"signals\":{\"Speed\":null,\"Gear\":3}}"));
+    assert_eq!(
+        decode(&["--json", "--details"])[1].split_once("\"signals\":").unwrap().1,
+        "{\"Speed\":{\"value\":null,\"unit\":\"rpm\",\"text\":\"not available\",\"raw\":65535},\
+         \"Gear\":{\"value\":3,\"text\":\"Drive\",\"raw\":3}}}"
+    );
+    assert!(
+        cantap("available", &["decode", "--db", "truck.dbc", "truck.log", "--csv"])
+            .1
+            .contains("1.100000,1,0CF00400,EEC1,Speed,,rpm,not available\r\n")
+    );
+}
+
+#[test]
+fn a_wide_table_has_a_column_per_signal() {
+    truck("wide");
+    std::fs::write(
+        directory("wide").join("both.log"),
+        format!("{TRUCK_TRACE}(62.000000) can0 618#004023FF\n"),
+    )
+    .unwrap();
+    let arguments = ["decode", "--db", "truck.dbc", "--db", "dashboard.toml", "both.log", "--csv", "--wide"];
+    let (code, out, err) = cantap("wide", &arguments);
+    assert_eq!(code, Some(0), "{err}");
+    assert_eq!(
+        out,
+        "time,EEC1.Speed [rpm],EEC1.Gear,Dashboard.Speed [km/h],\"Dashboard.EngineSpeed [rpm, mean]\",Dashboard.Ignition\r\n\
+         1.000000,1800,3,,,\r\n1.100000,,3,,,\r\n1.200000,1792,3,,,\r\n61.200000,1792.125,3,,,\r\n62.000000,,,88,5119.5,0\r\n"
+    );
+}
+
+#[test]
+fn a_resampled_table_holds_values_but_not_over_a_silence() {
+    truck("resampled");
+    let arguments =
+        ["decode", "--db", "truck.dbc", "truck.log", "--csv", "--resample", "500ms", "--signal", "Speed"];
+    let (code, out, err) = cantap("resampled", &arguments);
+    assert_eq!(code, Some(0), "{err}");
+    // The signal comes every 100 ms: a second later nobody knows it any more.
+    assert_eq!(out, "time,EEC1.Speed [rpm]\r\n1.500000,1792\r\n2.000000,1792\r\n61.500000,1792.125\r\n");
+}
+
+#[test]
+fn warnings_can_be_left_out_and_a_database_that_replaces_another_is_told() {
+    let twice = "BO_ 1560 Other: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nBO_ 4000 Far: 1 A\n";
+    std::fs::write(directory("quiet").join("other.dbc"), twice).unwrap();
+    let arguments = ["decode", "--db", "body.dbc", "--db", "other.dbc", "trace.log"];
+    let (code, _, err) = cantap("quiet", &arguments);
+    assert_eq!(code, Some(0));
+    assert!(err.contains("cantap: other.dbc: line 3: Far: identifier 0xFA0 does not fit 11 bits"), "{err}");
+    assert!(
+        err.contains("cantap: other.dbc replaces 1 message of body.dbc with the same identifier, Body\n"),
+        "{err}"
+    );
+    let (code, _, err) = cantap("quiet", &[&arguments[..], &["--quiet"]].concat());
+    assert_eq!(code, Some(0));
+    assert!(!err.contains("other.dbc"), "{err}");
+    let (code, ..) = cantap("quiet", &[&arguments[..], &["--quiet", "--strict"]].concat());
+    assert_eq!(code, Some(1));
+}

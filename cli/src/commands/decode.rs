@@ -4,6 +4,7 @@ mod csv;
 mod decoded;
 mod json;
 mod text;
+mod wide;
 
 pub use decoded::Seconds;
 pub use text::write_values;
@@ -11,11 +12,14 @@ pub use text::write_values;
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::time::Duration;
 
 use cantap::TraceEvent;
 use cantap_signals::Decoder;
 
 use self::decoded::Decoded;
+use self::wide::Wide;
+use crate::args;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
@@ -26,9 +30,11 @@ use crate::live::LiveArgs;
     cantap decode --db car.dbc trace.log\n  \
     cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
     candump -L can0 | cantap decode --db car.dbc - --json\n  \
+    cantap decode --db car.dbc trace.log --csv --resample 100ms > drive.csv\n  \
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
 JSON lines are {\"t\", \"ch\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
-    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where a float is not a number).")]
+    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
+With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.")]
 pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
@@ -44,9 +50,22 @@ pub struct Args {
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]
     csv: bool,
+    /// A column per signal and a line per frame. Written at the end of the trace.
+    #[arg(long, requires = "csv")]
+    wide: bool,
+    /// A column per signal and a line every TIME, with the last value of each signal; empty where it was silent for long or
+    /// frames were lost. Written at the end of the trace.
+    #[arg(long, value_name = "TIME", requires = "csv", value_parser = args::positive_duration)]
+    resample: Option<Duration>,
     /// One JSON object per message.
     #[arg(long)]
     json: bool,
+    /// Unit, text and raw value of each signal too.
+    #[arg(long, requires = "json")]
+    details: bool,
+    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    #[arg(short, long)]
+    quiet: bool,
     #[command(flatten)]
     read: ReadArgs,
 }
@@ -65,7 +84,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.databases.is_empty() {
         anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
     }
-    let decoder = args.databases.load_some(args.read.strict, &args.signals)?;
+    let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
     let count = decode(args, &decoder, &mut out)?;
     out.flush()?;
@@ -81,7 +100,9 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
     let mut records = args.read.open_either(args.input.as_deref(), &args.live)?;
     let mut count = Count::default();
     let mut values = Vec::new();
-    if args.csv {
+    let step_ns = args.resample.map(|step| i64::try_from(step.as_nanos()).unwrap_or(i64::MAX));
+    let mut wide = (args.wide || step_ns.is_some()).then(|| Wide::new(step_ns)).transpose()?;
+    if args.csv && wide.is_none() {
         csv::write_header(out)?;
     }
     let mut batch = Vec::new();
@@ -89,6 +110,9 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
         for record in &batch {
             if let TraceEvent::Lost { count: lost, .. } = record.event {
                 count.lost += u64::from(lost);
+                if let Some(wide) = &mut wide {
+                    wide.interrupt(record.channel);
+                }
             }
             let Some(frame) = record.frame() else { continue };
             count.frames += 1;
@@ -99,16 +123,21 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
             }
             count.decoded += 1;
             count.signals += values.len() as u64;
-            let decoded = Decoded { record, frame, message: decoder.message(reference), values: &values };
-            match (args.json, args.csv) {
-                (true, _) => json::write(out, &decoded)?,
-                (_, true) => csv::write(out, &decoded)?,
+            let message = decoder.message(reference);
+            let decoded = Decoded { record, frame, reference, message, values: &values };
+            match (&mut wide, args.json, args.csv) {
+                (Some(wide), ..) => wide.push(&decoded)?,
+                (_, true, _) => json::write(out, &decoded, args.details)?,
+                (.., true) => csv::write(out, &decoded)?,
                 _ => text::write(out, &decoded)?,
             }
         }
         if records.may_wait() {
             out.flush()?;
         }
+    }
+    if let Some(wide) = wide {
+        wide.finish(out)?;
     }
     Ok(count)
 }

@@ -56,6 +56,9 @@ pub struct Args {
     /// Heading; the trace's name without it.
     #[arg(long)]
     title: Option<String>,
+    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    #[arg(short, long)]
+    quiet: bool,
     #[command(flatten)]
     read: ReadArgs,
 }
@@ -97,7 +100,7 @@ fn collect(args: &Args) -> anyhow::Result<Plot> {
             "no database to find signals in; give one with --db FILE, or ask for --bus-load or --timing ID"
         );
     }
-    let decoder = args.databases.load_some(args.read.strict, &args.signals)?;
+    let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder);
     for_each(args.read.open(&args.input)?, |record| collector.push(record))?;
     if collector.is_empty() {

@@ -72,6 +72,9 @@ pub struct Args {
     /// One JSON object per record.
     #[arg(long)]
     json: bool,
+    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    #[arg(short, long)]
+    quiet: bool,
     #[command(flatten)]
     read: ReadArgs,
 }
@@ -81,7 +84,7 @@ const MAX_CONTEXT: usize = 1_000_000;
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let decoder = args.databases.load(args.read.strict)?;
+    let decoder = args.databases.load(args.read.strict, args.quiet)?;
     let text = args.condition.as_ref().or(args.positional.as_ref());
     let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
     let condition = condition.context("condition")?;

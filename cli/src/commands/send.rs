@@ -118,7 +118,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 impl Args {
     fn frames(&self) -> anyhow::Result<Vec<Frame>> {
-        let database = self.databases.load(false)?;
+        let database = self.databases.load(false, self.quiet)?;
         let frame = |text: &String| {
             // A colon stands in no frame and in every message with values.
             if text.contains(':') && !text.contains('#') {

@@ -4,6 +4,9 @@
 
 #![forbid(unsafe_code)]
 
+mod cadence;
 #[cfg(feature = "plot")]
 pub mod plot;
 pub mod stats;
+
+pub use cadence::Cadence;

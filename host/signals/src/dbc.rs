@@ -7,127 +7,29 @@
 use std::collections::HashMap;
 
 use can_dbc::{
-    AttributeValue, Comment, Dbc, DbcError, MessageId, MultiplexIndicator, NumericValue,
-    SignalExtendedValueType, ValueDescription, ValueType,
+    AttributeDefinition, AttributeValue, AttributeValueType, Comment, Dbc, MessageId, MultiplexIndicator,
+    NumericValue, SignalExtendedValueType, ValueDescription, ValueType,
 };
-use cantap_wire::Id;
-use pest::error::{ErrorVariant, LineColLocation};
 
+use super::dbc_parse::{self, NO_MESSAGE};
 use super::dbc_text::{self, Index};
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::ByteOrder;
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
 use super::{layout, validate};
 
-/// Holds signals that belong to no message.
-const NO_MESSAGE: &str = "VECTOR__INDEPENDENT_SIG_MSG";
-
-/// The flag of an extended identifier in a DBC file.
-const EXTENDED: u64 = 1 << 31;
-
-/// More than this many statements that cannot be understood, and it is no DBC file.
-const MAX_IGNORED: usize = 50;
-
 /// Parses a DBC file's content; `file` is its name for messages to the user.
+///
+/// A message with a fault that would make values wrong is left out, with a warning. It is an error if nothing is left.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     let text = dbc_text::decode(bytes);
-    let index = Index::of(&text);
     let mut faults = Vec::new();
-    let faulty = |faults| DatabaseError::Faulty { file: file.to_owned(), faults };
-    let Some(dbc) = parse_leniently(&text, &index, &mut faults) else {
-        return Err(faulty(faults));
+    let Some((dbc, index)) = dbc_parse::parse(&text, &mut faults) else {
+        faults.retain(|fault| !fault.kind.is_warning());
+        return Err(DatabaseError::Faulty { file: file.to_owned(), faults });
     };
     let messages = Reader::new(&dbc, &index, &mut faults).messages();
     validate::finish(file, messages, faults)
-}
-
-/// Parses; statements that decoding does not need and can-dbc does not understand are left out.
-fn parse_leniently(text: &str, index: &Index, faults: &mut Vec<Fault>) -> Option<Dbc> {
-    let mut text = std::borrow::Cow::Borrowed(text);
-    loop {
-        // can-dbc's grammar accepts a file's last line only with its end.
-        let complete = format!("{text}\n");
-        let error = match Dbc::try_from(complete.as_str()) {
-            Ok(dbc) => return Some(dbc),
-            Err(error) => error,
-        };
-        let (line, reason) = explain(&error, &text);
-        let statement = index.statement_at(line);
-        if let Some(needless) = statement.filter(|statement| statement.is_needless())
-            && faults.len() < MAX_IGNORED
-            && can_be_left_out(&text[needless.range.clone()])
-        {
-            let (line, symbol) = (needless.line, needless.symbol.clone());
-            faults.push(Fault { line, symbol, kind: FaultKind::Ignored(reason) });
-            text = dbc_text::blank(&text, needless.range.clone()).into();
-            continue;
-        }
-        let symbol = statement.map(|statement| statement.symbol.clone()).unwrap_or_default();
-        let form = statement.and_then(|statement| form(&statement.keyword));
-        let reason = form.map_or(reason, |form| format!("not of the form {form}"));
-        faults.retain(|fault| !fault.kind.is_warning());
-        faults.push(Fault { line, symbol, kind: FaultKind::Syntax(reason) });
-        return None;
-    }
-}
-
-/// Whether a statement is still there, and has not swallowed definitions because a quote is missing.
-fn can_be_left_out(statement: &str) -> bool {
-    !statement.trim().is_empty() && !statement.contains("\nBO_ ") && !statement.contains("\n SG_ ")
-}
-
-/// What a statement looks like. can-dbc's errors mostly point at its start and name rules of a grammar
-/// that nobody knows.
-fn form(keyword: &str) -> Option<&'static str> {
-    Some(match keyword {
-        "BO_" => "BO_ ID NAME : LENGTH SENDER",
-        "SG_" => r#"SG_ NAME : START|LENGTH@ORDER+ (FACTOR,OFFSET) [MIN|MAX] "UNIT" RECEIVER"#,
-        "VAL_" => r#"VAL_ ID SIGNAL 0 "TEXT" 1 "TEXT" ;"#,
-        "SIG_VALTYPE_" => "SIG_VALTYPE_ ID SIGNAL : 1 ; (1 float, 2 double)",
-        "SG_MUL_VAL_" => "SG_MUL_VAL_ ID SIGNAL MULTIPLEXER 1-3, 5-5 ;",
-        _ => return None,
-    })
-}
-
-/// The line of can-dbc's error and what it says, in words.
-fn explain(error: &DbcError, text: &str) -> (u32, String) {
-    // can-dbc says which number is wrong and not where. A signal's place goes before other numbers,
-    // because nothing else may not be negative.
-    let line_of = |token: &str| {
-        let (start, length) = (format!(": {token}|"), format!("|{token}@"));
-        let is_word = |line: &str| {
-            let mut words = line.split(|c: char| !(c.is_ascii_alphanumeric() || "+-._".contains(c)));
-            words.any(|word| word == token)
-        };
-        let place = text.lines().position(|line| line.contains(&start) || line.contains(&length));
-        place.or_else(|| text.lines().position(is_word)).map_or(0, |line| line as u32 + 1)
-    };
-    match error {
-        DbcError::Pest(error) => {
-            let (LineColLocation::Pos((line, column)) | LineColLocation::Span((line, column), _)) =
-                error.line_col;
-            let rest = text.lines().nth(line - 1).unwrap_or_default().chars().skip(column - 1);
-            let found: String = rest.take(20).collect();
-            let found =
-                if found.is_empty() { "the line ends".to_owned() } else { format!("found {found:?}") };
-            let expected = match &error.variant {
-                ErrorVariant::ParsingError { positives, .. } if (1..=4).contains(&positives.len()) => {
-                    let names: Vec<_> =
-                        positives.iter().map(|rule| format!("{rule:?}").replace('_', " ")).collect();
-                    format!("expected {}, {found}", names.join(" or "))
-                }
-                _ => format!("not understood, {found}"),
-            };
-            (line as u32, format!("column {column}: {expected}"))
-        }
-        DbcError::InvalidInt(token)
-        | DbcError::InvalidUint(token)
-        | DbcError::InvalidFloat(token)
-        | DbcError::InvalidNumericValue(token)
-        | DbcError::UnknownMultiplexIndicator(token) => (line_of(token), error.to_string()),
-        DbcError::MessageIdOutOfRange(id) => (line_of(&id.to_string()), error.to_string()),
-        _ => (0, error.to_string()),
-    }
 }
 
 /// Everything that the file says about one signal elsewhere than in its definition.
@@ -157,6 +59,7 @@ struct Reader<'a> {
     faults: &'a mut Vec<Fault>,
     messages: HashMap<MessageId, MessageExtras<'a>>,
     signals: HashMap<(MessageId, &'a str), SignalExtras<'a>>,
+    frame_formats: FrameFormats<'a>,
     /// Whether extended frames without a format of their own are J1939's.
     j1939: bool,
     /// What signals without a start value of their own get.
@@ -229,13 +132,16 @@ impl<'a> Reader<'a> {
         let protocol =
             dbc.attribute_values_database.iter().find(|attribute| attribute.name == "ProtocolType");
         let protocol = protocol.map(|attribute| &attribute.value).or(dbc.attribute_default("ProtocolType"));
-        let j1939 = match (dbc.attribute_default("VFrameFormat"), protocol) {
-            (Some(format), _) => is_j1939(format),
-            (None, Some(AttributeValue::String(protocol))) => protocol.eq_ignore_ascii_case("J1939"),
-            (None, _) => false,
+        let by_protocol = matches!(protocol, Some(AttributeValue::String(protocol)) if protocol.eq_ignore_ascii_case("J1939"));
+        let frame_formats = FrameFormats::of(dbc);
+        let j1939 = match dbc.attribute_default("VFrameFormat").and_then(|format| frame_formats.name(format))
+        {
+            // A 29-bit message is none of a standard frame: that default says nothing of it.
+            None | Some("StandardCAN" | "StandardCAN_FD") => by_protocol,
+            Some(format) => is_j1939(format),
         };
         let initial = dbc.attribute_default("GenSigStartValue").and_then(number);
-        Self { dbc, index, faults, messages, signals, j1939, initial }
+        Self { dbc, index, faults, messages, signals, frame_formats, j1939, initial }
     }
 
     fn messages(mut self) -> Vec<Message> {
@@ -255,12 +161,7 @@ impl<'a> Reader<'a> {
         let name = extras.long_name.unwrap_or(&message.name).to_owned();
         // can-dbc keeps 16 bits of a standard identifier: the file's own number is the truth.
         let written = self.index.messages.get(place).map_or(message.id.raw().into(), |&(id, _, _)| id);
-        let id = match u32::try_from(written & !EXTENDED) {
-            Ok(raw) if written & EXTENDED != 0 => Id::extended(raw),
-            Ok(raw) => Id::standard(raw),
-            Err(_) => None,
-        };
-        let Some(id) = id else {
+        let Some(id) = dbc_parse::id_of(written) else {
             self.faults.push(Fault { line, symbol: name, kind: FaultKind::Id(written) });
             return None;
         };
@@ -271,21 +172,27 @@ impl<'a> Reader<'a> {
             return None;
         };
         let mut definitions: Vec<_> = Vec::with_capacity(message.signals.len());
+        let mut is_usable = true;
         for definition in &message.signals {
             let line = self.index.signal_line(place, &definition.name);
             match signal_place(definition) {
                 Ok((start, length)) => definitions.push((definition, start, length, line)),
                 Err(kind) => {
+                    is_usable &= kind.is_warning();
                     let symbol = format!("{name}.{}", definition.name);
                     self.faults.push(Fault { line, symbol, kind });
                 }
             }
+        }
+        if !is_usable {
+            return None;
         }
         let places: HashMap<&str, usize> = definitions
             .iter()
             .enumerate()
             .map(|(place, &(definition, ..))| (definition.name.as_str(), place))
             .collect();
+        let format = extras.frame_format.and_then(|format| self.frame_formats.name(format));
         let plain_switch = plain_switch(&message.signals);
         let mut signals = Vec::with_capacity(definitions.len());
         for &(definition, start, length, line) in &definitions {
@@ -293,6 +200,10 @@ impl<'a> Reader<'a> {
             let default = SignalExtras::default();
             let extras = extras.unwrap_or(&default);
             let mut signal = signal(definition, extras, start, length);
+            if extras.float.is_some() && !matches!(length, 16 | 32 | 64) {
+                let symbol = format!("{name}.{}", signal.name);
+                self.faults.push(Fault { line, symbol, kind: FaultKind::OddFloat(length) });
+            }
             let initial = extras.initial.or(self.initial).unwrap_or_default();
             signal.initial_raw = initial as i64 as u64 & layout::mask(length);
             signal.line = line;
@@ -316,19 +227,39 @@ impl<'a> Reader<'a> {
             description: extras.comment.map(unescape).unwrap_or_default(),
             length,
             cycle_ms: extras.cycle_ms.filter(|&cycle| cycle > 0),
-            j1939: id.is_extended() && extras.frame_format.map_or(self.j1939, is_j1939),
+            j1939: id.is_extended() && format.map_or(self.j1939, is_j1939),
             signals,
             line,
         })
     }
 }
 
-/// `VFrameFormat` as text, or its place in Vector's enumeration.
-fn is_j1939(format: &AttributeValue) -> bool {
-    match format {
-        AttributeValue::String(text) => text == "J1939PG",
-        value => number(value) == Some(3.0),
+/// The names that the file gives to the values of `VFrameFormat`. Writers number them as they like.
+struct FrameFormats<'a>(Option<&'a [String]>);
+
+impl<'a> FrameFormats<'a> {
+    fn of(dbc: &'a Dbc) -> Self {
+        let names = dbc.attribute_definitions.iter().find_map(|definition| match definition {
+            AttributeDefinition::Message(name, AttributeValueType::Enum(names)) if name == "VFrameFormat" => {
+                Some(names.as_slice())
+            }
+            _ => None,
+        });
+        Self(names)
     }
+
+    fn name(&self, format: &'a AttributeValue) -> Option<&'a str> {
+        match (format, self.0) {
+            (AttributeValue::String(name), _) => Some(name),
+            (value, Some(names)) => names.get(number(value)? as usize).map(String::as_str),
+            // Vector's own list, where the file has none.
+            (value, None) => (number(value) == Some(3.0)).then_some("J1939PG"),
+        }
+    }
+}
+
+fn is_j1939(format: &str) -> bool {
+    format.eq_ignore_ascii_case("J1939PG")
 }
 
 fn number(value: &AttributeValue) -> Option<f64> {

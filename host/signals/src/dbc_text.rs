@@ -67,13 +67,6 @@ pub struct Statement {
     pub symbol: String,
 }
 
-impl Statement {
-    /// Whether decoding can do without it.
-    pub fn is_needless(&self) -> bool {
-        NEEDLESS.contains(&self.keyword.as_str())
-    }
-}
-
 /// Where everything is.
 #[derive(Debug, Default)]
 pub struct Index {
@@ -163,10 +156,9 @@ impl Index {
         self.signals.get(&(message, name.to_owned())).copied().unwrap_or_default()
     }
 
-    /// The statement that a line belongs to.
-    pub fn statement_at(&self, line: u32) -> Option<&Statement> {
-        let after = self.statements.partition_point(|statement| statement.line <= line);
-        self.statements.get(after.checked_sub(1)?)
+    /// The place in [`Self::statements`] of the one that a line belongs to.
+    pub fn place_at(&self, line: u32) -> Option<usize> {
+        self.statements.partition_point(|statement| statement.line <= line).checked_sub(1)
     }
 
     /// The line of the first statement of that keyword about a signal; 0 if unknown.
@@ -190,17 +182,6 @@ fn ends_in_string(line: &str, mut in_string: bool) -> bool {
         }
     }
     in_string
-}
-
-/// Replaces a statement by as many spaces as it has bytes, so that everything else keeps its place.
-pub fn blank(text: &str, range: Range<usize>) -> String {
-    let mut blanked = text[..range.start].to_owned();
-    let spaces = text[range.clone()]
-        .bytes()
-        .map(|byte| if byte == b'\n' || byte == b'\r' { byte.into() } else { ' ' });
-    blanked.extend(spaces);
-    blanked.push_str(&text[range.end..]);
-    blanked
 }
 
 #[cfg(test)]
@@ -231,16 +212,6 @@ mod tests {
             (index.message_line(1), index.signal_line(0, "One"), index.signal_line(1, "One")),
             (12, 9, 13)
         );
-        assert_eq!(index.statement_at(11).map(|s| s.line), Some(10));
-    }
-
-    #[test]
-    fn a_blanked_statement_moves_nothing() {
-        let index = Index::of(TEXT);
-        let blanked = blank(TEXT, index.statements[5].range.clone());
-        assert_eq!(blanked.lines().count(), TEXT.lines().count());
-        assert_eq!(Index::of(&blanked).signal_line(1, "One"), 13);
-        assert!(!blanked.contains("Neither"));
-        assert_eq!(blank("a\nµ°\nb", 2..7), "a\n    \nb");
+        assert_eq!(index.place_at(11), Some(5));
     }
 }

@@ -33,6 +33,18 @@ pub struct Decoder {
     /// For channels without an own database.
     common: Lookup,
     by_channel: HashMap<u8, Lookup>,
+    overrides: Vec<Override>,
+}
+
+/// Messages of one database that a later one of the same channel describes too, and otherwise.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Override {
+    /// The file whose messages do not count.
+    pub file: String,
+    /// The later file, whose do.
+    pub by: String,
+    /// The names of the messages that do not count.
+    pub messages: Vec<String>,
 }
 
 const NONE: u32 = u32::MAX;
@@ -64,18 +76,26 @@ impl Lookup {
         }
     }
 
-    fn insert(&mut self, place: u32, id: Id, j1939: bool) {
+    /// Adds a message; returns the one of the same identifier that it takes the place of. Messages below `own` are other
+    /// databases', and give way as parameter groups too.
+    fn insert(&mut self, place: u32, id: Id, j1939: bool, own: u32) -> Option<u32> {
         let raw = id.raw();
         if !id.is_extended() {
-            self.standard[raw as usize] = place;
-            return;
+            let before = std::mem::replace(&mut self.standard[raw as usize], place);
+            return (before != NONE).then_some(before);
         }
-        self.extended.insert(raw, place);
         if j1939 {
             let group = parameter_group(raw);
-            self.from_source.entry(group | raw & 0xFF).or_insert(place);
-            self.parameter_group.entry(group).or_insert(place);
+            let first_of_database = |lookup: &mut FxHashMap<u32, u32>, key| {
+                let entry = lookup.entry(key).or_insert(place);
+                if *entry < own {
+                    *entry = place;
+                }
+            };
+            first_of_database(&mut self.from_source, group | raw & 0xFF);
+            first_of_database(&mut self.parameter_group, group);
         }
+        self.extended.insert(raw, place)
     }
 
     fn find(&self, id: Id) -> Option<u32> {
@@ -101,32 +121,53 @@ impl Decoder {
     pub fn new(sources: Vec<Source>) -> Self {
         let mut common = Lookup::new();
         let mut by_channel = HashMap::new();
-        let mut messages = Vec::new();
+        let mut messages: Vec<(Option<u8>, Message, MessagePlan)> = Vec::new();
+        let mut overrides: Vec<Override> = Vec::new();
+        // Each database's file and first message.
+        let mut files: Vec<(u32, String)> = Vec::new();
         for Source { channel, database } in sources {
             let lookup = match channel {
                 None => &mut common,
                 Some(channel) => by_channel.entry(channel).or_insert_with(Lookup::new),
             };
+            let own = messages.len() as u32;
             for message in database.messages {
-                lookup.insert(messages.len() as u32, message.id, message.j1939);
+                let replaced = lookup.insert(messages.len() as u32, message.id, message.j1939, own);
+                if let Some(replaced) = replaced.filter(|&replaced| replaced < own) {
+                    let of = files.partition_point(|&(first, _)| first <= replaced) - 1;
+                    let (file, by) = (files[of].1.clone(), database.file.clone());
+                    let name = messages[replaced as usize].1.name.clone();
+                    match overrides.iter_mut().find(|known| known.file == file && known.by == by) {
+                        Some(known) => known.messages.push(name),
+                        None => overrides.push(Override { file, by, messages: vec![name] }),
+                    }
+                }
                 let plan = MessagePlan::new(&message, |_, _| true);
                 messages.push((channel, message, plan));
             }
+            files.push((own, database.file));
         }
-        Self { messages, common, by_channel }
+        Self { messages, common, by_channel, overrides }
     }
 
-    /// Treats every extended message as a J1939 parameter group, for databases that do not say so.
+    /// Messages that a later database of the same channel replaces.
+    pub fn overrides(&self) -> &[Override] {
+        &self.overrides
+    }
+
+    /// Treats every extended message as a J1939 parameter group, for databases that do not say so. To be called before signals
+    /// are chosen.
     pub fn assume_j1939(&mut self) {
-        for (place, (channel, message, _)) in self.messages.iter_mut().enumerate() {
+        for (place, (channel, message, plan)) in self.messages.iter_mut().enumerate() {
             if message.id.is_extended() && !message.j1939 {
                 message.j1939 = true;
+                *plan = MessagePlan::new(message, |_, _| true);
                 let lookup = match channel {
                     Some(channel) => self.by_channel.get_mut(channel),
                     None => Some(&mut self.common),
                 };
                 if let Some(lookup) = lookup {
-                    lookup.insert(place as u32, message.id, true);
+                    lookup.insert(place as u32, message.id, true, 0);
                 }
             }
         }

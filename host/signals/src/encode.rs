@@ -6,6 +6,7 @@ use cantap_wire::Frame;
 
 use super::decoder::{Decoder, MessageRef};
 use super::fault::MAX_SWITCHES;
+use super::j1939::{self, Indicator};
 use super::layout;
 use super::model::{Message, Multiplexed, Signal, ValueKind};
 use super::select::Suggestion;
@@ -82,6 +83,26 @@ pub enum EncodeError {
         signal: String,
         /// The text.
         text: String,
+        /// The texts that it takes, ready to be printed.
+        choices: String,
+    },
+    /// The text stands for several raw values.
+    #[error("{text:?} stands for several values of {signal}; choose one: {choices}")]
+    AmbiguousText {
+        /// The signal.
+        signal: String,
+        /// The text.
+        text: String,
+        /// The values, ready to be written in the text's place.
+        choices: String,
+    },
+    /// A fraction for a signal whose values are states.
+    #[error("{signal} has states and none between them, such as {value}; it takes a whole number{choices}")]
+    Fraction {
+        /// The signal.
+        signal: String,
+        /// The value.
+        value: String,
         /// The texts that it takes, ready to be printed.
         choices: String,
     },
@@ -251,16 +272,13 @@ fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<Me
 pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<Vec<u8>, EncodeError> {
     let mut raws = BTreeMap::new();
     for (name, input) in inputs {
-        let place = message.signals.iter().position(|signal| signal.name == *name).ok_or_else(|| {
-            let near = Suggestion::nearest(name, message.signals.iter().map(|signal| signal.name.as_str()));
-            EncodeError::UnknownSignal { message: message.name.clone(), name: name.clone(), near }
-        })?;
+        let place = place_of(message, name, inputs)?;
         let signal = &message.signals[place];
         if !fits(message, signal) {
             let (what, bytes) = (format!("signal {name}"), signal.bytes_needed());
             return Err(EncodeError::TooLong { what, bytes, room: "its message has fewer" });
         }
-        if raws.insert(place, raw(signal, input)?).is_some() {
+        if raws.insert(place, raw(message, signal, input)?).is_some() {
             return Err(EncodeError::Twice(name.clone()));
         }
     }
@@ -278,6 +296,23 @@ pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<V
         }
     }
     Ok(data)
+}
+
+/// Which of the message's signals a name means: of several under different values of a multiplexer, the one under the value
+/// that is given for that.
+fn place_of(message: &Message, name: &str, inputs: &[(String, Input)]) -> Result<usize, EncodeError> {
+    let signals = &message.signals;
+    let named: Vec<_> = (0..signals.len()).filter(|&place| signals[place].label() == name).collect();
+    let is_there = |place: &&usize| {
+        let Some(multiplexed) = multiplexed(signals, **place) else { return true };
+        let switch = &signals[multiplexed.switch];
+        let given = inputs.iter().find(|(name, _)| *name == switch.label());
+        given.is_some_and(|(_, input)| raw(message, switch, input).is_ok_and(|raw| multiplexed.matches(raw)))
+    };
+    named.iter().find(is_there).or(named.first()).copied().ok_or_else(|| {
+        let near = Suggestion::nearest(name, signals.iter().map(|signal| signal.name.as_str()));
+        EncodeError::UnknownSignal { message: message.name.clone(), name: name.to_owned(), near }
+    })
 }
 
 /// Whether the signal can be written. A database made by a program may have signals without bits.
@@ -361,49 +396,101 @@ fn values(ranges: &[std::ops::RangeInclusive<u64>]) -> String {
 }
 
 /// The bits for a value.
-fn raw(signal: &Signal, input: &Input) -> Result<u64, EncodeError> {
+fn raw(message: &Message, signal: &Signal, input: &Input) -> Result<u64, EncodeError> {
     let mask = layout::mask(signal.length);
     let (physical, text) = match input {
         Input::Raw(raw) if *raw <= mask => return Ok(*raw),
         Input::Raw(raw) => return Err(range_error(signal, format!("raw:{raw}"))),
-        Input::Text(text) => {
-            // A text stands for a raw value: the database's limits do not apply.
-            let integer = signal.values.value(text).ok_or_else(|| unknown_text(signal, text))?;
-            return raw_of_integer(signal, integer.into())
-                .or_else(|| raw_of_float(signal, integer as f64))
-                .ok_or_else(|| range_error(signal, text.clone()));
-        }
+        Input::Text(text) => return raw_of_text(message, signal, text),
         Input::Integer(value) => (*value as f64, value.to_string()),
         Input::Real(value) => (*value, value.to_string()),
     };
+    let unscaled = (physical - signal.offset) / signal.factor;
     let raw = match input {
         Input::Integer(value) if signal.integer(0).is_some() => {
             raw_of_integer(signal, unscaled_integer(signal, *value, physical))
         }
-        _ if signal.integer(0).is_some() => {
-            let unscaled = ((physical - signal.offset) / signal.factor).round_ties_even();
-            // A float beyond 64 bits becomes the largest integer, which no signal can hold.
-            raw_of_integer(signal, unscaled as i128)
-        }
-        _ => raw_of_float(signal, (physical - signal.offset) / signal.factor),
+        // A float beyond 64 bits becomes the largest integer, which no signal can hold.
+        _ if signal.integer(0).is_some() => raw_of_integer(signal, unscaled.round_ties_even() as i128),
+        _ => raw_of_float(signal, unscaled),
     };
     let raw = raw.filter(|_| physical.is_finite()).ok_or_else(|| range_error(signal, text.clone()))?;
+    if !signal.values.is_empty()
+        && signal.integer(0).is_some()
+        && (unscaled - unscaled.round()).abs() > STEP_ERROR
+    {
+        let choices = choices(signal);
+        return Err(EncodeError::Fraction { signal: signal.name.clone(), value: text, choices });
+    }
     let (low, high) = (signal.min.unwrap_or(f64::NEG_INFINITY), signal.max.unwrap_or(f64::INFINITY));
-    if physical < low || physical > high {
+    if !is_within(signal, physical, low, high) {
         return Err(EncodeError::Limits { signal: signal.name.clone(), value: text, low, high, raw });
     }
     Ok(raw)
 }
 
+/// Share of a step between two raw values that calculating with floats may cost.
+const STEP_ERROR: f64 = 1e-6;
+
+/// Whether a value is between limits, which a file gives in decimals that neither a factor nor a short float may be able to meet
+/// exactly: 204.70000000000002 is 204.7, and so is a float of 32 bits that is nearest to it.
+fn is_within(signal: &Signal, physical: f64, low: f64, high: f64) -> bool {
+    let nearest = |limit: f64| match signal.integer(0) {
+        Some(_) => None,
+        None => raw_of_float(signal, (limit - signal.offset) / signal.factor).map(|raw| signal.physical(raw)),
+    };
+    let slack = if signal.integer(0).is_some() { signal.factor.abs() * STEP_ERROR } else { 0.0 };
+    let low = nearest(low).map_or(low, |nearest| nearest.min(low)) - slack;
+    let high = nearest(high).map_or(high, |nearest| nearest.max(high)) + slack;
+    (low..=high).contains(&physical)
+}
+
+/// The bits for a text of the value table, or for what J1939 says in place of a value. The database's limits do not apply.
+fn raw_of_text(message: &Message, signal: &Signal, text: &str) -> Result<u64, EncodeError> {
+    let values = signal.values.values(text);
+    let raws: Vec<_> = values
+        .iter()
+        .filter_map(|&value| {
+            raw_of_integer(signal, value.into()).or_else(|| raw_of_float(signal, value as f64))
+        })
+        .collect();
+    match raws[..] {
+        [raw] => Ok(raw),
+        [] if !values.is_empty() => Err(range_error(signal, text.to_owned())),
+        [] => {
+            let indicators = [Indicator::Error, Indicator::NotAvailable].into_iter();
+            let meant = indicators.filter(|indicator| message.j1939 && indicator.name() == text);
+            let raw = meant.filter_map(|indicator| j1939::raw_of(signal, indicator)).next();
+            raw.ok_or_else(|| unknown_text(signal, text))
+        }
+        _ => {
+            let choices: Vec<_> = raws.iter().map(|raw| format!("raw:{raw}")).collect();
+            let choices = choices.join(", ");
+            Err(EncodeError::AmbiguousText { signal: signal.name.clone(), text: text.to_owned(), choices })
+        }
+    }
+}
+
 fn unknown_text(signal: &Signal, text: &str) -> EncodeError {
+    let choices = choices(signal);
+    EncodeError::UnknownText { signal: signal.name.clone(), text: text.to_owned(), choices }
+}
+
+/// The texts that a signal takes, as the end of a sentence; each once.
+fn choices(signal: &Signal) -> String {
     /// A longer list hides the message.
     const SHOWN: usize = 12;
-    let mut texts: Vec<_> = signal.values.iter().map(|(_, text)| text).take(SHOWN + 1).collect();
-    if texts.len() > SHOWN {
-        texts[SHOWN] = "…";
+    let mut texts: Vec<&str> = Vec::new();
+    for (_, text) in signal.values.iter() {
+        if !texts.contains(&text) {
+            texts.push(text);
+        }
+        if texts.len() > SHOWN {
+            texts[SHOWN] = "…";
+            break;
+        }
     }
-    let choices = if texts.is_empty() { String::new() } else { format!(" or one of: {}", texts.join(", ")) };
-    EncodeError::UnknownText { signal: signal.name.clone(), text: text.to_owned(), choices }
+    if texts.is_empty() { String::new() } else { format!(" or one of: {}", texts.join(", ")) }
 }
 
 fn range_error(signal: &Signal, value: String) -> EncodeError {

@@ -2,6 +2,8 @@
 
 use std::fmt;
 
+use super::clean;
+
 /// Why a database could not be read.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
@@ -62,10 +64,11 @@ impl fmt::Display for Fault {
         if self.line > 0 {
             write!(f, "line {}: ", self.line)?;
         }
+        // Words of the file stand in both.
         if !self.symbol.is_empty() {
-            write!(f, "{}: ", self.symbol)?;
+            write!(f, "{}: ", clean::line(&self.symbol))?;
         }
-        fmt::Display::fmt(&self.kind, f)
+        f.write_str(&clean::line(&self.kind.to_string()))
     }
 }
 
@@ -135,13 +138,22 @@ pub enum FaultKind {
     /// A statement about a message or signal that is not there.
     #[error("there is no such message or signal; the statement is left out")]
     UnknownSymbol,
-    /// A statement that decoding does not need and that cannot be understood.
+    /// A statement without which the values stay right, and that cannot be understood.
     #[error("this statement is not understood and left out ({0})")]
     Ignored(String),
+    /// A statement that a message's values depend on cannot be understood.
+    #[error("a statement that its values depend on is not understood")]
+    Related,
+    /// A message with a fault that would make values wrong, in a database that can be used without it.
+    #[error("{0}; the message is left out")]
+    LeftOut(Box<FaultKind>),
+    /// A float with a length that most programs refuse.
+    #[error("a float of {0} bits is unusual; it is read as the upper bits of the next longer one")]
+    OddFloat(u16),
 }
 
 impl FaultKind {
-    /// Whether the database can be used all the same. Everything else makes values wrong.
+    /// Whether the message can be used all the same. Everything else makes values wrong.
     pub fn is_warning(&self) -> bool {
         matches!(
             self,
@@ -153,6 +165,8 @@ impl FaultKind {
                 | Self::NoMultiplexer(_)
                 | Self::UnknownSymbol
                 | Self::Ignored(_)
+                | Self::LeftOut(_)
+                | Self::OddFloat(_)
         )
     }
 }

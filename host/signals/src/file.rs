@@ -167,7 +167,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
         message(entry.into_inner(), line, bytes, &mut faults)
     });
     let messages = messages.collect();
-    validate::finish(file, messages, faults)
+    validate::finish_strictly(file, messages, faults)
 }
 
 fn line_of(bytes: &[u8], offset: usize) -> u32 {

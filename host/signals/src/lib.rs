@@ -8,17 +8,21 @@
 
 #![forbid(unsafe_code)]
 
+mod clean;
 pub mod condition;
 pub mod dbc;
+mod dbc_parse;
 mod dbc_text;
 mod decoder;
 pub mod encode;
 mod fault;
 pub mod file;
+mod j1939;
 mod layout;
 mod model;
 mod number;
 mod plan;
+mod scale;
 pub mod search;
 mod select;
 pub mod trigger;
@@ -26,9 +30,10 @@ mod validate;
 
 use std::path::Path;
 
-pub use decoder::{Decoder, MessageRef, Source};
+pub use decoder::{Decoder, MessageRef, Override, Source};
 pub use encode::{EncodeError, Encoded};
 pub use fault::{DatabaseError, Fault, FaultKind};
+pub use j1939::Indicator;
 pub use layout::ByteOrder;
 pub use model::{
     Alarm, Alarms, Colour, Database, Digital, Message, Multiplexed, Signal, ValueKind, ValueTable,

@@ -1,14 +1,17 @@
 //! What a database says: messages, signals, and how their bits become values.
 
+use std::borrow::Cow;
 use std::fmt;
 use std::ops::RangeInclusive;
 use std::str::FromStr;
 
 use cantap_wire::Id;
 
+use super::clean;
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};
 use super::number::Number;
+use super::scale::Scale;
 
 /// A set of messages, from one file.
 #[derive(Clone, Debug, Default, PartialEq)]
@@ -89,6 +92,8 @@ pub struct Signal {
     pub alarms: Alarms,
     /// The colour to draw it with.
     pub colour: Option<Colour>,
+    /// How many signals of the same name come before it that a frame may carry together with it: mostly none.
+    pub twins_before: u16,
     /// The line in the file, from 1; 0 if there is none.
     pub line: u32,
 }
@@ -222,11 +227,19 @@ impl ValueTable {
         Some(&self.entries[found].1)
     }
 
-    /// The raw value for a text: as written, else without regard to case.
-    pub fn value(&self, text: &str) -> Option<i64> {
-        let find = |same: fn(&str, &str) -> bool| self.entries.iter().find(|(_, entry)| same(entry, text));
-        let entry = find(|a, b| a == b).or_else(|| find(str::eq_ignore_ascii_case))?;
-        Some(entry.0)
+    /// The raw values that a text stands for, in ascending order: those with the text as written, else those with it in
+    /// another case. Many tables use a text for several values.
+    pub fn values(&self, text: &str) -> Vec<i64> {
+        let find = |same: fn(&str, &str) -> bool| -> Vec<i64> {
+            self.entries.iter().filter(|(_, entry)| same(entry, text)).map(|(value, _)| *value).collect()
+        };
+        let exact = find(|a, b| a == b);
+        if exact.is_empty() { find(str::eq_ignore_ascii_case) } else { exact }
+    }
+
+    /// Makes the texts fit for a terminal.
+    pub(super) fn clean(&mut self) {
+        self.entries.iter_mut().for_each(|(_, text)| clean::make(text, clean::line));
     }
 
     /// All values with their texts, by value.
@@ -262,7 +275,16 @@ impl Signal {
             digital: None,
             alarms: Alarms::default(),
             colour: None,
+            twins_before: 0,
             line: 0,
+        }
+    }
+
+    /// Its name, with a number behind it (`Speed#2`) where a frame may carry another of this name.
+    pub fn label(&self) -> Cow<'_, str> {
+        match self.twins_before {
+            0 => Cow::Borrowed(&self.name),
+            before => format!("{}#{}", self.name, before + 1).into(),
         }
     }
 
@@ -304,9 +326,20 @@ impl Signal {
         }
     }
 
-    /// The physical value of the raw bits, as a float.
+    /// The physical value of the raw bits, as a float: of an integer the one nearest to the decimal that factor and offset
+    /// make, 0.7 and not 0.7000000000000001.
     pub fn physical(&self, raw: u64) -> f64 {
-        self.raw_to_f64(raw) * self.factor + self.offset
+        self.scale().apply(self.raw_to_f64(raw))
+    }
+
+    /// How raw values become physical ones.
+    pub(super) fn scale(&self) -> Scale {
+        match self.kind {
+            ValueKind::Unsigned | ValueKind::Signed | ValueKind::SignMagnitude => {
+                Scale::of(self.factor, self.offset)
+            }
+            ValueKind::Half | ValueKind::Single | ValueKind::Double => Scale::plain(self.factor, self.offset),
+        }
     }
 
     /// The physical value of the raw bits, exact where it is an integer.

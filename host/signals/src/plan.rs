@@ -10,6 +10,7 @@ use super::fault::MAX_SWITCHES;
 use super::layout;
 use super::layout::ByteOrder;
 use super::model::{Message, Signal, ValueKind};
+use super::scale::Scale;
 
 /// One decoded signal.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -18,7 +19,8 @@ pub struct SignalValue {
     pub signal: u32,
     /// Its bits.
     pub raw: u64,
-    /// Its physical value. [`Signal::number`] gives it exactly where 53 bits are not enough.
+    /// Its physical value; not a number where J1939 says that there is none ([`Message::indicator`]).
+    /// [`Signal::number`] gives it exactly where 53 bits are not enough.
     pub value: f64,
 }
 
@@ -60,8 +62,9 @@ struct SignalPlan {
     field: Field,
     conversion: Conversion,
     index: u32,
-    factor: f64,
-    offset: f64,
+    scale: Scale,
+    /// Whether some of its bits may say that there is no value.
+    indicates: bool,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -132,8 +135,8 @@ impl MessagePlan {
                 ValueKind::Double => Conversion::Double(unused),
                 ValueKind::Half | ValueKind::Single | ValueKind::SignMagnitude => Conversion::Other,
             };
-            let (factor, offset) = (signal.factor, signal.offset);
-            let plan = SignalPlan { field, conversion, index: index as u32, factor, offset };
+            let (scale, indicates) = (signal.scale(), message.j1939);
+            let plan = SignalPlan { field, conversion, index: index as u32, scale, indicates };
             match groups.iter_mut().find(|group| group.conditions == conditions) {
                 Some(group) => group.signals.push(plan),
                 None => groups.push(Group { conditions, signals: vec![plan] }),
@@ -180,7 +183,9 @@ impl SignalPlan {
             Conversion::Double(left) => f64::from_bits(raw << left),
             Conversion::Other => message.signals[self.index as usize].raw_to_f64(raw),
         };
-        Some(SignalValue { signal: self.index, raw, value: unscaled * self.factor + self.offset })
+        let no_value = self.indicates && message.signals[self.index as usize].indicator(raw).is_some();
+        let value = if no_value { f64::NAN } else { self.scale.apply(unscaled) };
+        Some(SignalValue { signal: self.index, raw, value })
     }
 }
 

@@ -2,29 +2,109 @@
 
 use std::collections::{HashMap, HashSet};
 
-use super::fault::MAX_SWITCHES;
-use super::fault::{DatabaseError, Fault, FaultKind};
+use super::clean;
+use super::fault::{DatabaseError, Fault, FaultKind, MAX_SWITCHES};
 use super::model::{Database, Message, Signal, ValueKind};
 
 /// The longest message: J1939's transport protocol carries 1785 bytes.
 pub const MAX_BYTES: u16 = 1785;
 
-/// Makes a database of the messages, unless one of the faults (found before or here) forbids it.
-pub fn finish(
-    file: &str,
-    mut messages: Vec<Message>,
-    mut faults: Vec<Fault>,
-) -> Result<Database, DatabaseError> {
-    for message in &mut messages {
-        check_message(message, &mut faults);
+/// Makes a database of the messages. Those with a fault that makes values wrong are left out with a warning; where no message
+/// is left, and something was wrong, it is an error.
+pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Result<Database, DatabaseError> {
+    let mut usable = Vec::with_capacity(messages.len());
+    for mut message in messages {
+        let before = faults.len();
+        check_message(&mut message, &mut faults);
+        if faults[before..].iter().all(|fault| fault.kind.is_warning()) {
+            usable.push(message);
+        }
     }
-    check_ids(&messages, &mut faults);
+    check_ids(&usable, &mut faults);
     faults.sort_by_key(|fault| fault.line);
-    if faults.iter().any(|fault| !fault.kind.is_warning()) {
-        faults.retain(|fault| !fault.kind.is_warning());
+    let is_serious = |fault: &Fault| !fault.kind.is_warning() || matches!(fault.kind, FaultKind::LeftOut(_));
+    if usable.is_empty() && faults.iter().any(is_serious) {
+        faults.retain(is_serious);
+        for fault in &mut faults {
+            if let FaultKind::LeftOut(kind) = &fault.kind {
+                fault.kind = (**kind).clone();
+            }
+        }
         return Err(DatabaseError::Faulty { file: file.to_owned(), faults });
     }
-    Ok(Database { file: file.to_owned(), messages, warnings: faults })
+    for fault in faults.iter_mut().filter(|fault| !fault.kind.is_warning()) {
+        fault.kind = FaultKind::LeftOut(fault.kind.clone().into());
+    }
+    let mut database = Database { file: file.to_owned(), messages: usable, warnings: faults };
+    tidy(&mut database);
+    Ok(database)
+}
+
+/// As [`finish`], for a file whose reader wrote it: whatever makes values wrong is an error.
+pub fn finish_strictly(
+    file: &str,
+    messages: Vec<Message>,
+    faults: Vec<Fault>,
+) -> Result<Database, DatabaseError> {
+    let mut database = finish(file, messages, faults)?;
+    let is_left_out = |fault: &Fault| matches!(fault.kind, FaultKind::LeftOut(_));
+    if database.warnings.iter().any(is_left_out) {
+        let mut faults = std::mem::take(&mut database.warnings);
+        faults.retain(is_left_out);
+        for fault in &mut faults {
+            if let FaultKind::LeftOut(kind) = &fault.kind {
+                fault.kind = (**kind).clone();
+            }
+        }
+        return Err(DatabaseError::Faulty { file: file.to_owned(), faults });
+    }
+    Ok(database)
+}
+
+/// Texts become fit for a terminal, and signals of one name in one frame get numbers.
+fn tidy(database: &mut Database) {
+    for message in &mut database.messages {
+        clean::make(&mut message.name, clean::line);
+        clean::make(&mut message.description, clean::lines);
+        for signal in &mut message.signals {
+            clean::make(&mut signal.name, clean::line);
+            clean::make(&mut signal.unit, clean::line);
+            clean::make(&mut signal.description, clean::lines);
+            signal.values.clean();
+        }
+        number_twins(message);
+    }
+}
+
+/// Numbers signals of the same name that one frame may carry together.
+fn number_twins(message: &mut Message) {
+    let mut by_name: HashMap<&str, Vec<usize>> = HashMap::new();
+    for (place, signal) in message.signals.iter().enumerate() {
+        by_name.entry(&signal.name).or_default().push(place);
+    }
+    let mut numbers = Vec::new();
+    for places in by_name.into_values().filter(|places| places.len() > 1) {
+        for (at, &place) in places.iter().enumerate() {
+            let meets = |other: &&usize| meet(&message.signals[**other], &message.signals[place]);
+            numbers.push((place, places[..at].iter().filter(meets).count() as u16));
+        }
+    }
+    for (place, twins_before) in numbers {
+        message.signals[place].twins_before = twins_before;
+    }
+}
+
+/// Whether one frame may carry both. Signals under different values of one multiplexer never meet.
+fn meet(one: &Signal, other: &Signal) -> bool {
+    match (&one.multiplexed, &other.multiplexed) {
+        (Some(one), Some(other)) if one.switch == other.switch => {
+            let overlap = |a: &std::ops::RangeInclusive<u64>| {
+                other.values.iter().any(|b| a.start() <= b.end() && b.start() <= a.end())
+            };
+            one.values.iter().any(overlap)
+        }
+        _ => true,
+    }
 }
 
 fn check_ids(messages: &[Message], faults: &mut Vec<Fault>) {

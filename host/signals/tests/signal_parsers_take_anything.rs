@@ -210,7 +210,7 @@ fn large_files_take_no_more_than_their_share() {
         (format!("{head}{signals}{chain}"), false),
         (format!("{head}{}", "\n".repeat(100_000)), true),
         (format!("{head}CM_ \"{}", "x".repeat(1_000_000)), true),
-        (format!("{head}CM_ \"\n{}", head.repeat(1000)), false),
+        (format!("{head}CM_ \"\n{}", head.repeat(1000)), true),
         ("[".repeat(100_000), false),
         (format!("NS_ :{}", "\n\tX_".repeat(10_000)), true),
     ] {

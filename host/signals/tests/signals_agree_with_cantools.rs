@@ -8,7 +8,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Output};
 
-use cantap_signals::{Decoder, Number, Source};
+use cantap_signals::{Decoder, Number, Signal, Source};
 use cantap_trace::Id;
 use serde::Deserialize;
 
@@ -92,15 +92,19 @@ fn own_files() -> Vec<PathBuf> {
     files
 }
 
-/// The very same number, not one near it.
-#[expect(clippy::float_cmp, reason = "both sides compute the same operations on the same bits")]
-fn equal(theirs: &str, ours: Number) -> bool {
+/// The same number. An integer is the very same; cantools multiplies by the factor's float and is off by its rounding,
+/// where ours is the float nearest to the decimal result.
+fn equal(theirs: &str, ours: Number, signal: &Signal) -> bool {
     match (theirs.parse::<i128>(), ours) {
         (Ok(theirs), Number::Integer(ours)) => theirs == ours,
-        (Ok(theirs), Number::Real(ours)) => theirs as f64 == ours,
-        (Err(_), ours) => {
-            let (theirs, ours) = (theirs.parse::<f64>().unwrap(), ours.as_f64());
-            theirs == ours || theirs.is_nan() && ours.is_nan()
+        (theirs_integer, ours) => {
+            let theirs = theirs_integer.map_or_else(|_| theirs.parse::<f64>().unwrap(), |value| value as f64);
+            let ours = ours.as_f64();
+            let size = (theirs - signal.offset).abs().max(signal.offset.abs());
+            let near = if signal.integer(0).is_some() { 4.0 * f64::EPSILON * size } else { 0.0 };
+            (theirs - ours).abs() <= near
+                || theirs.to_bits() == ours.to_bits()
+                || theirs.is_nan() && ours.is_nan()
         }
     }
 }
@@ -120,12 +124,14 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     for value in &values {
         let signal = &message.signals[value.signal as usize];
         let number = signal.number(value.raw);
-        let same = equal(&format!("{:?}", value.value), number);
+        let same = value.value.to_bits() == number.as_f64().to_bits();
         assert!(
-            same || matches!(number, Number::Integer(n) if n.abs() > 1 << 53),
+            same || value.value.is_nan()
+                && (number.as_f64().is_nan() || message.indicator(signal, value.raw).is_some())
+                || matches!(number, Number::Integer(n) if n.abs() > 1 << 53),
             "{number} is not {value:?}"
         );
-        ours.insert(signal.name.as_str(), number);
+        ours.insert(signal.name.as_str(), (number, signal));
         if let Some(text) = signal.text(value.raw) {
             texts.insert(signal.name.clone(), text.to_owned());
         }
@@ -144,7 +150,9 @@ fn differences(decoder: &Decoder, line: &Line) -> Vec<String> {
     for (name, theirs) in theirs {
         match ours.remove(name.as_str()) {
             None => found.push(format!("{name} is missing here")),
-            Some(ours) if !equal(theirs, ours) => found.push(format!("{name}: theirs {theirs}, ours {ours}")),
+            Some((ours, signal)) if !equal(theirs, ours, signal) => {
+                found.push(format!("{name}: theirs {theirs}, ours {ours}"));
+            }
             Some(_) => {}
         }
     }

@@ -3,34 +3,35 @@
 use std::borrow::Cow;
 use std::io::{self, Write};
 
-use super::decoded::{Decoded, Seconds};
+use super::decoded::{Decoded, Reading, Seconds};
 
 pub fn write_header(out: &mut impl Write) -> io::Result<()> {
     out.write_all(b"time,channel,id,message,signal,value,unit,text\r\n")
 }
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
-    let Decoded { record, frame, message, values } = decoded;
+    let Decoded { record, frame, message, values, .. } = decoded;
     for value in *values {
-        let signal = &message.signals[value.signal as usize];
+        let reading = Reading::of(message, value);
         write!(
             out,
-            "{},{},{},{},{},{},{},{}\r\n",
+            "{},{},{},{},{},",
             Seconds(record.time_ns),
             record.channel,
             frame.id(),
             field(&message.name),
-            field(&signal.name),
-            signal.number(value.raw),
-            field(&signal.unit),
-            field(signal.text(value.raw).unwrap_or_default()),
+            field(&reading.label),
         )?;
+        if let Some(number) = reading.number {
+            write!(out, "{number}")?;
+        }
+        write!(out, ",{},{}\r\n", field(&reading.signal.unit), field(reading.text().unwrap_or_default()))?;
     }
     Ok(())
 }
 
 /// Quotes what a comma, a quote or a line end would break.
-fn field(text: &str) -> Cow<'_, str> {
+pub fn field(text: &str) -> Cow<'_, str> {
     if text.contains([',', '"', '\n', '\r']) {
         format!("\"{}\"", text.replace('"', "\"\"")).into()
     } else {

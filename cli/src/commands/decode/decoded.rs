@@ -1,14 +1,50 @@
-//! A decoded frame, and how its time is written.
+//! A decoded frame, and how its time and values are written.
+
+use std::borrow::Cow;
 
 use cantap::{TraceFrame, TraceRecord};
-use cantap_signals::{Message, SignalValue};
+use cantap_signals::{Message, MessageRef, Number, Signal, SignalValue};
 
-/// A decoded frame, as the three outputs take it.
+/// A decoded frame, as the outputs take it.
 pub struct Decoded<'a> {
     pub record: &'a TraceRecord,
     pub frame: &'a TraceFrame,
+    pub reference: MessageRef,
     pub message: &'a Message,
     pub values: &'a [SignalValue],
+}
+
+/// What one signal of a frame says.
+pub struct Reading<'a> {
+    pub signal: &'a Signal,
+    /// Its name in this message.
+    pub label: Cow<'a, str>,
+    /// Its value; `None` where the bits say that there is none.
+    pub number: Option<Number>,
+    /// What J1939 says in place of a value.
+    pub indicator: Option<&'static str>,
+    /// The value table's text.
+    pub text: Option<&'a str>,
+}
+
+impl<'a> Reading<'a> {
+    pub fn of(message: &'a Message, value: &SignalValue) -> Self {
+        let signal = &message.signals[value.signal as usize];
+        let indicator = message.indicator(signal, value.raw).map(cantap_signals::Indicator::name);
+        let number = signal.number(value.raw);
+        Self {
+            signal,
+            label: signal.label(),
+            number: indicator.is_none().then_some(number),
+            indicator,
+            text: signal.text(value.raw),
+        }
+    }
+
+    /// The value table's text, or what stands in place of a value.
+    pub fn text(&self) -> Option<&'a str> {
+        self.text.or(self.indicator)
+    }
 }
 
 /// Seconds with six decimals, or nine where the trace has them.

@@ -2,23 +2,37 @@
 
 use std::io::{self, Write};
 
-use super::decoded::{Decoded, Seconds};
+use super::decoded::{Decoded, Reading, Seconds};
 
-pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
-    let Decoded { record, frame, message, values } = decoded;
+/// Writes the object; with `details` each signal is an object too, with its unit and text.
+pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {
+    let Decoded { record, frame, message, values, .. } = decoded;
     // Written by hand: numbers keep every digit, and it is several times faster than a tree of values.
     write!(out, "{{\"t\":{},\"ch\":{},\"id\":\"{}\",", Seconds(record.time_ns), record.channel, frame.id())?;
     out.write_all(b"\"message\":")?;
     serde_json::to_writer(&mut *out, &message.name)?;
     out.write_all(b",\"signals\":{")?;
     for (at, value) in values.iter().enumerate() {
-        let signal = &message.signals[value.signal as usize];
+        let reading = Reading::of(message, value);
         if at > 0 {
             out.write_all(b",")?;
         }
-        serde_json::to_writer(&mut *out, &signal.name)?;
-        let number = signal.number(value.raw);
-        if number.is_finite() { write!(out, ":{number}")? } else { out.write_all(b":null")? }
+        serde_json::to_writer(&mut *out, &reading.label)?;
+        out.write_all(if details { b":{\"value\":" } else { b":" })?;
+        match reading.number.filter(|number| number.is_finite()) {
+            Some(number) => write!(out, "{number}")?,
+            None => out.write_all(b"null")?,
+        }
+        if details {
+            let unit = Some(reading.signal.unit.as_str()).filter(|unit| !unit.is_empty());
+            for (key, text) in [("unit", unit), ("text", reading.text())] {
+                if let Some(text) = text {
+                    write!(out, ",\"{key}\":")?;
+                    serde_json::to_writer(&mut *out, text)?;
+                }
+            }
+            write!(out, ",\"raw\":{}}}", value.raw)?;
+        }
     }
     out.write_all(b"}}\n")
 }

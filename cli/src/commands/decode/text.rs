@@ -4,10 +4,10 @@ use std::io::{self, Write};
 
 use cantap_signals::{Message, SignalValue};
 
-use super::decoded::{Decoded, Seconds};
+use super::decoded::{Decoded, Reading, Seconds};
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
-    let Decoded { record, frame, message, values } = decoded;
+    let Decoded { record, frame, message, values, .. } = decoded;
     // candump numbers interfaces from 0.
     let interface = record.channel.saturating_sub(1);
     write!(out, "({}) can{interface} {} {}:", Seconds(record.time_ns), frame.id(), message.name)?;
@@ -15,16 +15,25 @@ pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     writeln!(out)
 }
 
-/// ` Speed = 88 km/h, Gear = 3 (Drive)`.
+/// ` Speed = 88 km/h, Gear = 3 (Drive), Temperature = not available`.
 pub fn write_values(out: &mut impl Write, message: &Message, values: &[SignalValue]) -> io::Result<()> {
     for (at, value) in values.iter().enumerate() {
-        let signal = &message.signals[value.signal as usize];
         let comma = if at == 0 { "" } else { "," };
-        write!(out, "{comma} {} = {}", signal.name, signal.number(value.raw).for_people())?;
-        if !signal.unit.is_empty() {
-            write!(out, " {}", signal.unit)?;
+        let reading = Reading::of(message, value);
+        write!(out, "{comma} {} = ", reading.label)?;
+        match (reading.number, reading.indicator) {
+            (Some(number), _) => {
+                write!(out, "{}", number.for_people())?;
+                if !reading.signal.unit.is_empty() {
+                    write!(out, " {}", reading.signal.unit)?;
+                }
+            }
+            (None, indicator) => out.write_all(indicator.unwrap_or_default().as_bytes())?,
         }
-        if let Some(text) = signal.text(value.raw) {
+        // "not available (Not Available)" says it twice.
+        let said =
+            |text: &&str| reading.indicator.is_some_and(|indicator| text.eq_ignore_ascii_case(indicator));
+        if let Some(text) = reading.text.filter(|text| !said(text)) {
             write!(out, " ({text})")?;
         }
     }

@@ -130,6 +130,11 @@ impl SignalTable {
         row.min = row.min.min(value.value);
         row.max = row.max.max(value.value);
         let (time_ns, last) = (record.time_ns, value.value);
+        if last.is_nan() {
+            // No value is none to draw, and what comes next does not continue what was before.
+            row.gap = true;
+            return;
+        }
         // Time that runs backwards, as where a file begins anew, leaves nothing to compare with.
         if row.samples.back().is_some_and(|sample| time_ns < sample.time_ns) {
             row.samples.clear();
@@ -192,10 +197,32 @@ impl SignalTable {
     /// The value with its text and unit.
     pub fn text(&self, row: &SignalRow) -> String {
         let signal = self.signal(row);
-        match signal.text(row.raw) {
-            Some(text) => format!("{} ({text})", signal.number(row.raw)),
-            None => format!("{} {}", signal.number(row.raw), signal.unit).trim_end().to_owned(),
+        if let Some(indicator) = self.decoder.message(row.message).indicator(signal, row.raw) {
+            return signal.text(row.raw).unwrap_or(indicator.name()).to_owned();
         }
+        let number = signal.number(row.raw).for_people();
+        match signal.text(row.raw) {
+            Some(text) => format!("{number} ({text})"),
+            None => format!("{number} {}", signal.unit).trim_end().to_owned(),
+        }
+    }
+
+    /// As [`Self::text`] in so many columns: digits go before the unit does.
+    pub fn short_text(&self, row: &SignalRow, columns: usize) -> String {
+        let text = self.text(row);
+        let signal = self.signal(row);
+        if text.chars().count() <= columns
+            || signal.unit.is_empty()
+            || signal.text(row.raw).is_some()
+            || row.value.is_nan()
+        {
+            return text.chars().take(columns).collect();
+        }
+        let room = columns.saturating_sub(signal.unit.chars().count() + 1);
+        let fits = |text: &String| text.chars().count() <= room;
+        let rounded = (0..=6).rev().map(|decimals| format!("{:.decimals$}", row.value)).find(fits);
+        let number = rounded.unwrap_or_else(|| format!("{:.1e}", row.value));
+        format!("{number} {}", signal.unit).chars().take(columns).collect()
     }
 
     /// The alarm that a row's value raises.

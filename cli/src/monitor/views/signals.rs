@@ -50,10 +50,11 @@ fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'s
         Some(Alarm::Below) => (if theme.unicode { "▼" } else { "v" }, theme.below()),
         None => (" ", Style::new()),
     };
-    let full = format!("{}.{}", seen.signals.message_name(row), signal.name);
-    let name = if full.chars().count() > name_columns { signal.name.clone() } else { full };
+    let label = signal.label();
+    let full = format!("{}.{label}", seen.signals.message_name(row));
+    let name = if full.chars().count() > name_columns { label.into_owned() } else { full };
     let name: String = name.chars().take(name_columns).collect();
-    let value: String = seen.signals.text(row).chars().take(22).collect();
+    let value = seen.signals.short_text(row, 21);
     Line::from(vec![
         Span::raw(if row.chosen { "* " } else { "  " }),
         Span::raw(format!("{} {name:<name_columns$} ", row.channel)),
@@ -65,6 +66,9 @@ fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'s
 
 /// A value in at most ten columns.
 pub fn short(value: f64) -> String {
+    if value.is_nan() {
+        return "–".to_owned();
+    }
     let text = format!("{value}");
     if text.len() <= 10 {
         return text;

@@ -47,8 +47,8 @@ enum Expression {
     Part(Part),
     Byte(Box<Expression>),
     Signal(usize),
-    /// Whether a signal's value has a text: for each candidate the raw value, if it has that text.
-    HasText(usize, Vec<Option<i64>>),
+    /// Whether a signal's value has a text: for each candidate the raw values with that text.
+    HasText(usize, Vec<Vec<i64>>),
     Not(Box<Expression>),
     Negative(Box<Expression>),
     Binary(Operator, Box<Expression>, Box<Expression>),
@@ -136,7 +136,7 @@ impl Condition {
                 let (candidate, raw, _) = self.slots[*slot].last?;
                 let (message, index) = self.slots[*slot].candidates[candidate];
                 let signal = &self.decoder.message(message).signals[index as usize];
-                boolean(raws[candidate].is_some() && signal.table_key(raw) == raws[candidate])
+                boolean(signal.table_key(raw).is_some_and(|key| raws[candidate].contains(&key)))
             }
             Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record))?),
             Expression::Negative(inner) => self.evaluate(inner, record).map(|value| -value),
@@ -321,8 +321,8 @@ impl Binder<'_> {
             let decoder = self.decoder;
             let signals = self.slots[slot].candidates.iter();
             let signals = signals.map(|&(message, index)| &decoder.message(message).signals[index as usize]);
-            let raws: Vec<_> = signals.clone().map(|signal| signal.values.value(wanted)).collect();
-            if raws.iter().all(Option::is_none) {
+            let raws: Vec<_> = signals.clone().map(|signal| signal.values.values(wanted)).collect();
+            if raws.iter().all(Vec::is_empty) {
                 let texts: Vec<_> =
                     signals.flat_map(|signal| signal.values.iter().map(|(_, text)| text)).collect();
                 let choices =

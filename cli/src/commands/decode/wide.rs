@@ -1,0 +1,167 @@
+//! For spreadsheets and numerical programs: a column per signal, a line per frame or per interval of time.
+//!
+//! Which columns there are is known only at the end, so lines wait in a file that nobody else sees.
+
+use std::collections::HashMap;
+use std::fs::File;
+use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
+
+use anyhow::Context;
+use cantap_analysis::Cadence;
+use cantap_signals::MessageRef;
+
+use super::csv::field;
+use super::decoded::{Decoded, Reading, Seconds};
+
+/// Between cells of a waiting line: it stands in no number and no time.
+const SEPARATOR: char = '\x1f';
+
+/// Lines that wait, and the columns that they need.
+pub struct Wide {
+    waiting: BufWriter<File>,
+    columns: Vec<Column>,
+    places: HashMap<(u8, MessageRef, u32), usize>,
+    /// Distance of lines; one per frame without it.
+    step_ns: Option<i64>,
+    /// When the next line is due.
+    due_ns: Option<i64>,
+}
+
+struct Column {
+    channel: u8,
+    /// `Message.Signal`, with its unit.
+    name: String,
+    /// The last value, and when it came.
+    last: Option<(i64, String)>,
+    cadence: Cadence,
+}
+
+impl Wide {
+    pub fn new(step_ns: Option<i64>) -> anyhow::Result<Self> {
+        let file = tempfile::tempfile()
+            .context("the lines need room for a temporary file; make some, or name a folder in TMPDIR")?;
+        let (columns, places) = (Vec::new(), HashMap::new());
+        Ok(Self { waiting: BufWriter::new(file), columns, places, step_ns, due_ns: None })
+    }
+
+    /// Takes a frame.
+    pub fn push(&mut self, decoded: &Decoded) -> io::Result<()> {
+        let time_ns = decoded.record.time_ns;
+        self.advance(time_ns)?;
+        let mut cells: Vec<(usize, String)> = Vec::with_capacity(decoded.values.len());
+        for value in decoded.values {
+            let reading = Reading::of(decoded.message, value);
+            let place = self.place(decoded, value.signal, &reading);
+            let number = reading.number.filter(|number| number.is_finite());
+            let column = &mut self.columns[place];
+            column.cadence.arrive(time_ns);
+            let text = number.map(|number| number.to_string()).unwrap_or_default();
+            if self.step_ns.is_none() {
+                cells.push((place, text));
+            } else {
+                column.last = Some((time_ns, text));
+            }
+        }
+        if self.step_ns.is_none() && !cells.is_empty() {
+            let mut line = vec![""; self.columns.len()];
+            for (place, text) in &cells {
+                line[*place] = text;
+            }
+            write_line(&mut self.waiting, time_ns, &line)?;
+        }
+        Ok(())
+    }
+
+    /// Frames of the channel are missing: its last values are the present ones no longer.
+    pub fn interrupt(&mut self, channel: u8) {
+        for column in self.columns.iter_mut().filter(|column| column.channel == channel) {
+            column.last = None;
+        }
+    }
+
+    fn place(&mut self, decoded: &Decoded, signal: u32, reading: &Reading) -> usize {
+        let channel = decoded.record.channel;
+        let columns = &mut self.columns;
+        *self.places.entry((channel, decoded.reference, signal)).or_insert_with(|| {
+            let unit = &reading.signal.unit;
+            let unit = if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
+            let name = format!("{}.{}{unit}", decoded.message.name, reading.label);
+            columns.push(Column {
+                channel,
+                name,
+                last: None,
+                cadence: Cadence::new(decoded.message.cycle_ms),
+            });
+            columns.len() - 1
+        })
+    }
+
+    /// Writes the lines that are due before `now_ns`.
+    fn advance(&mut self, now_ns: i64) -> io::Result<()> {
+        let Some(step_ns) = self.step_ns else { return Ok(()) };
+        let mut due_ns = match self.due_ns {
+            // A clock that is set back begins anew.
+            Some(due_ns) if now_ns >= due_ns.saturating_sub(step_ns) => due_ns,
+            // Lines stand at whole multiples.
+            _ => now_ns.div_euclid(step_ns).saturating_add(1).saturating_mul(step_ns),
+        };
+        while due_ns <= now_ns {
+            let mut any = false;
+            let cells: Vec<_> = self
+                .columns
+                .iter()
+                .map(|column| {
+                    let current =
+                        column.last.as_ref().filter(|(since, _)| !column.cadence.is_silence(due_ns - since));
+                    any |= current.is_some();
+                    current.map_or("", |(_, text)| text)
+                })
+                .collect();
+            if any {
+                write_line(&mut self.waiting, due_ns, &cells)?;
+                due_ns = due_ns.saturating_add(step_ns);
+            } else {
+                // Nothing more comes until now.
+                due_ns = now_ns.div_euclid(step_ns).saturating_add(1).saturating_mul(step_ns);
+            }
+        }
+        self.due_ns = Some(due_ns);
+        Ok(())
+    }
+
+    /// Writes the table.
+    pub fn finish(mut self, out: &mut impl Write) -> anyhow::Result<()> {
+        if let Some(due_ns) = self.due_ns {
+            // The last values have their line too.
+            self.advance(due_ns)?;
+        }
+        let of_several = self.columns.iter().any(|column| column.channel != self.columns[0].channel);
+        write!(out, "time")?;
+        for Column { channel, name, .. } in &self.columns {
+            let name = if of_several { format!("{channel}:{name}") } else { name.clone() };
+            write!(out, ",{}", field(&name))?;
+        }
+        write!(out, "\r\n")?;
+        let mut file = self.waiting.into_inner().map_err(io::IntoInnerError::into_error)?;
+        file.rewind()?;
+        for line in BufReader::new(file).lines() {
+            let line = line?;
+            let mut cells = 0;
+            for (at, cell) in line.split(SEPARATOR).enumerate() {
+                write!(out, "{}{cell}", if at == 0 { "" } else { "," })?;
+                cells = at;
+            }
+            // Columns that came later.
+            write!(out, "{}\r\n", ",".repeat(self.columns.len() - cells))?;
+        }
+        Ok(())
+    }
+}
+
+fn write_line(out: &mut impl Write, time_ns: i64, cells: &[&str]) -> io::Result<()> {
+    write!(out, "{}", Seconds(time_ns))?;
+    for cell in cells {
+        write!(out, "{SEPARATOR}{cell}")?;
+    }
+    writeln!(out)
+}

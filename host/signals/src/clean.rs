@@ -1,0 +1,55 @@
+//! Texts of files, fit for a terminal.
+
+use std::borrow::Cow;
+
+/// Whether a character moves the cursor, starts an escape sequence, ends a line or turns the direction of writing: none of
+/// that may come from a file that somebody else wrote.
+fn is_harmful(character: char) -> bool {
+    character.is_control()
+        || matches!(
+            character,
+            '\u{2028}' | '\u{2029}' | '\u{200E}' | '\u{200F}' | '\u{202A}'..='\u{202E}' | '\u{2066}'..='\u{2069}'
+        )
+}
+
+/// The text on one line, with `\u{FFFD}` for what a terminal would obey. Line ends and tabs become spaces.
+pub fn line(text: &str) -> Cow<'_, str> {
+    if !text.contains(is_harmful) {
+        return Cow::Borrowed(text);
+    }
+    let text = text.replace("\r\n", "\n");
+    let harmless = |character| match character {
+        '\n' | '\r' | '\t' => ' ',
+        character if is_harmful(character) => '\u{FFFD}',
+        character => character,
+    };
+    text.chars().map(harmless).collect::<String>().into()
+}
+
+/// As [`line`], but with the text's own lines, each ended by `\n`.
+pub fn lines(text: &str) -> Cow<'_, str> {
+    if !text.contains(is_harmful) {
+        return Cow::Borrowed(text);
+    }
+    let text = text.replace("\r\n", "\n").replace('\r', "\n");
+    text.split('\n').map(line).collect::<Vec<_>>().join("\n").into()
+}
+
+/// Makes a string fit, where it is not.
+pub fn make(text: &mut String, clean: fn(&str) -> Cow<'_, str>) {
+    if let Cow::Owned(cleaned) = clean(text) {
+        *text = cleaned;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn nothing_that_a_terminal_obeys_is_left() {
+        assert_eq!(line("\x1b[31mred\r\nnext\u{9b}2J\u{202e}"), "\u{FFFD}[31mred next\u{FFFD}2J\u{FFFD}");
+        assert_eq!(lines("one\r\ntwo\x07\rthree"), "one\ntwo\u{FFFD}\nthree");
+        assert!(matches!(line("°C µ 温度"), Cow::Borrowed(_)));
+    }
+}

@@ -4,6 +4,11 @@ use std::borrow::Cow;
 
 use cantap::wire::record::{BusErrorKind, ErrorState, TransmitFailure};
 
+/// `1 frame`, `2 frames`.
+pub fn counted(count: usize, noun: &str) -> String {
+    format!("{count} {noun}{}", if count == 1 { "" } else { "s" })
+}
+
 /// A kind of error in the words of the field.
 pub fn error_name(kind: BusErrorKind) -> &'static str {
     match kind {

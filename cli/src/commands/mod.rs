@@ -7,6 +7,7 @@ pub mod capture;
 pub mod care;
 pub mod completions;
 pub mod convert;
+pub mod db;
 pub mod decode;
 pub mod defaults;
 pub mod demo;
@@ -58,7 +59,9 @@ pub enum Command {
     /// Write the manual pages.
     #[command(hide = true)]
     Man(man::Args),
-    /// Show a trace as signals, by DBC or signal file.
+    /// Show what databases say, and how they suit a trace.
+    Db(db::Args),
+    /// Show a trace as signals, by a database.
     Decode(decode::Args),
     /// Capture the worst traffic there is, without a board, and check that nothing is lost silently.
     Demo(demo::Args),
@@ -107,6 +110,7 @@ impl Command {
             Self::Capture(args) => capture::run(&args),
             Self::Completions(args) => completions::run(&args, line),
             Self::Man(args) => man::run(&args, line),
+            Self::Db(args) => db::run(&args),
             Self::Decode(args) => decode::run(&args),
             Self::Demo(args) => demo::run(&args),
             Self::Info(args) => info::run(&args),

@@ -459,8 +459,8 @@ fn raw_of_text(message: &Message, signal: &Signal, text: &str) -> Result<u64, En
         [] if !values.is_empty() => Err(range_error(signal, text.to_owned())),
         [] => {
             let indicators = [Indicator::Error, Indicator::NotAvailable].into_iter();
-            let meant = indicators.filter(|indicator| message.j1939 && indicator.name() == text);
-            let raw = meant.filter_map(|indicator| j1939::raw_of(signal, indicator)).next();
+            let mut meant = indicators.filter(|indicator| message.j1939 && indicator.name() == text);
+            let raw = meant.find_map(|indicator| j1939::raw_of(signal, indicator));
             raw.ok_or_else(|| unknown_text(signal, text))
         }
         _ => {

@@ -16,9 +16,9 @@ pub enum DatabaseError {
         /// The system's reason.
         source: std::io::Error,
     },
-    /// Neither a DBC nor a cantap signal file.
+    /// The suffix is that of no database.
     #[error(
-        "{file} is no known kind of database; use a .dbc file, or a .toml signal file (docs/signal-file.md)"
+        "{file} is no known kind of database; use a .dbc, .kcd or .sym file, or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.

@@ -18,15 +18,19 @@ pub mod encode;
 mod fault;
 pub mod file;
 mod j1939;
+pub mod kcd;
 mod layout;
 mod model;
 mod number;
+mod picture;
 mod plan;
 mod scale;
 pub mod search;
 mod select;
+pub mod sym;
 pub mod trigger;
 mod validate;
+mod xml;
 
 use std::path::Path;
 
@@ -42,7 +46,7 @@ pub use number::Number;
 pub use plan::SignalValue;
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, or `.toml` for cantap's own signal file.
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, or `.toml` for cantap's own signal file.
 ///
 /// Faults that leave a database usable are in [`Database::warnings`].
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
@@ -51,6 +55,8 @@ pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     let parse: fn(&str, &[u8]) -> Result<Database, DatabaseError> = match suffix.to_ascii_lowercase().as_str()
     {
         "dbc" => dbc::parse,
+        "kcd" => kcd::parse,
+        "sym" => sym::parse,
         "toml" => file::parse,
         _ => return Err(DatabaseError::UnknownKind { file }),
     };

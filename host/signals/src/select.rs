@@ -53,6 +53,11 @@ impl Selection {
         self.patterns.is_empty() || self.patterns.iter().any(|pattern| matches(pattern, message, signal))
     }
 
+    /// Whether a message's name is chosen.
+    pub fn names(&self, message: &Message) -> bool {
+        self.patterns.iter().any(|pattern| pattern.matches(&message.name))
+    }
+
     /// Fails if one of the patterns chooses nothing of these messages: most likely a slip of the pen.
     pub fn check<'a>(
         &self,

@@ -1,7 +1,7 @@
 """What cantools decodes, as JSON lines, for tests/signals_agree_with_cantools.rs.
 
     cantools_peer.py decode FILE...    100 random payloads per message of each database
-    cantools_peer.py files DIR         fetch cantools' source from PyPI and print its .dbc test files
+    cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
 
 Values are printed as text: integers of any size, floats with every digit.
 """
@@ -44,7 +44,7 @@ def decode_file(path):
     import cantools
 
     try:
-        database = cantools.database.load_file(path, database_format="dbc", strict=False)
+        database = cantools.database.load_file(path, database_format=pathlib.Path(path).suffix.lower()[1:], strict=False)
     except Exception as error:  # whatever makes cantools refuse a file is its answer
         print(json.dumps({"file": path, "refused": str(error).splitlines()[0]}))
         return
@@ -76,8 +76,9 @@ def fetch(directory):
         subprocess.run([*command, f"cantools=={version('cantools')}", "--dest", directory], check=True)
         with contextlib.closing(tarfile.open(directory / f"{release}.tar.gz")) as archive:
             archive.extractall(directory, filter="data")
-    files = (directory / release / "tests" / "files" / "dbc").iterdir()
-    print("\n".join(sorted(str(path) for path in files if path.suffix.lower() == ".dbc")))
+    for kind in ("dbc", "kcd", "sym"):
+        files = (directory / release / "tests" / "files" / kind).iterdir()
+        print("\n".join(sorted(str(path) for path in files if path.suffix.lower() == f".{kind}")))
 
 
 if __name__ == "__main__":

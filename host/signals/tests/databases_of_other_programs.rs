@@ -1,9 +1,11 @@
 //! What databases in use have, and what a reader must make of it: own numberings, doubled texts and names, damage, and texts that
 //! a terminal would obey.
 
+use std::fmt::Write as _;
+
 use cantap_signals::condition::Condition;
 use cantap_signals::{Database, Decoder, Indicator, Source, dbc, encode};
-use cantap_trace::{Direction, Frame, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, Frame, TraceEvent, TraceFrame, TraceRecord};
 
 fn database(text: &str) -> Database {
     dbc::parse("x.dbc", text.as_bytes()).unwrap()
@@ -18,7 +20,7 @@ fn warnings(text: &str) -> Vec<String> {
 }
 
 fn decoded(decoder: &Decoder, frame: &str) -> Option<Vec<(String, String, Option<Indicator>)>> {
-    let frame: Frame = frame.parse().unwrap();
+    let frame: TraceFrame = frame.parse().unwrap();
     let mut values = Vec::new();
     let message = decoder.message(decoder.decode(1, &frame, &mut values)?);
     let line = |value: &cantap_signals::SignalValue| {
@@ -212,7 +214,7 @@ fn one_bad_message_leaves_the_others() {
 fn warnings_are_not_counted_against_a_database() {
     let mut text = "BO_ 6 Good: 8 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\n".to_owned();
     for n in 0..300 {
-        text += &format!("BA_ \"Broken{n}\" BO_ five;\n");
+        writeln!(text, "BA_ \"Broken{n}\" BO_ five;").unwrap();
     }
     let database = database(&text);
     assert_eq!((database.messages.len(), database.warnings.len()), (1, 300));
@@ -287,4 +289,26 @@ fn signals_of_one_name_keep_both_values() {
     let sent = |text| encode::encode(&decoder, None, text).unwrap().frame.to_string();
     assert_eq!(sent("M:Speed=1,Speed#2=2"), "005#010200");
     assert_eq!(sent("N:Page=2,Temp=3"), "006#020003");
+}
+
+/// 64 bytes, with a signal behind the eighth.
+#[test]
+fn fd_frames_decode_as_far_as_they_reach() {
+    let decoder = decoder(
+        "BO_ 5 M: 64 A\n SG_ First : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ Last : 504|8@1+ (1,0) [0|0] \"\" A\n SG_ Wide : 71|16@0+ (0.1,0) [0|0] \"\" A\n",
+    );
+    let data = |length: usize| (0..length).fold(String::new(), |data, n| data + &format!("{n:02X}"));
+    let names = |frame: &str| -> Vec<_> {
+        decoded(&decoder, frame)
+            .unwrap()
+            .into_iter()
+            .map(|(name, number, _)| format!("{name}={number}"))
+            .collect()
+    };
+    assert_eq!(names(&format!("005##1{}", data(64))), ["First=0", "Last=63", "Wide=205.7"]);
+    assert_eq!(names(&format!("005##1{}", data(12))), ["First=0", "Wide=205.7"]);
+    let mut condition = Condition::new("byte[63] == 63 and Wide == 205.7", &decoder).unwrap();
+    let frame: TraceFrame = format!("005##0{}", data(64)).parse().unwrap();
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+    assert!(condition.holds(&TraceRecord { time_ns: 0, channel: 1, event }));
 }

@@ -20,6 +20,8 @@ const REFUSED: &[(&str, &str)] = &[
         "incorrect-sig_valtype.dbc",
         "a SIG_VALTYPE_ for an unknown signal is a warning here: nothing decodes wrong for it",
     ),
+    ("issue_138.sym", "a multiplexer without bits is a name for the only variant there is"),
+    ("jopp-5.0.sym", "version 5 is read here"),
     ("incorrect-val.dbc", "a VAL_ for an unknown signal is a warning here: nothing decodes wrong for it"),
 ];
 
@@ -30,6 +32,19 @@ const DIFFERENT: &[(&str, &str, &str)] = &[
         "Message1",
         "the signal ends beyond its message: cantools decodes nothing, here it is left out",
     ),
+    ("bad_message_length.kcd", "Message1", "as in the DBC file"),
+    ("bad_message_length.sym", "Message1", "as in the DBC file"),
+    ("message_layout.kcd", "Message3", "the signal ends beyond its message"),
+    ("message_layout.kcd", "Message5", "signals overlap"),
+    ("message_layout.kcd", "Message7", "a signal of 128 bits is left out"),
+    ("message_layout.kcd", "Message8", "a signal of 128 bits is left out"),
+    ("dump.kcd", "Message1", "a text for 0 is that of the float 0 here, not of every float below 1"),
+    (
+        "the_homer.kcd",
+        "SteeringInfo",
+        "another bus of the file has the identifier too: the later message counts",
+    ),
+    ("the_homer.kcd", "Gear", "texts for ranges of values (LabelGroup) are read here"),
     (
         "issue_63.dbc",
         "AFT1PSI2",

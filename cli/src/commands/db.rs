@@ -1,0 +1,126 @@
+//! `cantap db`: what databases say, and how they suit a trace.
+
+mod coverage;
+mod describe;
+
+use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use cantap_signals::Database;
+use serde_json::json;
+
+use crate::input::ReadArgs;
+use crate::words::counted;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap db car.dbc\n  \
+    cantap db car.dbc -m EngineData -m 'Body*'\n  \
+    cantap db car.dbc --coverage trace.log\n\n\
+In a layout the highest bit is on the left; < is a signal's most significant bit, x its least significant one,\n\
+X a bit that several signals have.")]
+pub struct Args {
+    /// The databases.
+    #[arg(required = true, value_name = "FILE")]
+    files: Vec<PathBuf>,
+    /// Show these messages in full: layout, signals, texts, comments. A name with *, ? and [a-z], or an identifier in hexadecimal
+    /// (3 or 8 digits). Can be repeated.
+    #[arg(short, long = "message", value_name = "PATTERN")]
+    messages: Vec<String>,
+    /// Compare with this trace: which identifiers the databases lack, which messages never came, actual against nominal cycles.
+    #[arg(long, value_name = "TRACE", conflicts_with = "messages")]
+    coverage: Option<PathBuf>,
+    /// List everything that is wrong with the files.
+    #[arg(long, conflicts_with_all = ["messages", "coverage"])]
+    warnings: bool,
+    /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.
+    #[arg(long)]
+    j1939: bool,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let databases: Vec<Database> =
+        args.files.iter().map(|path| cantap_signals::load(path)).collect::<Result<_, _>>()?;
+    let mut out = BufWriter::new(std::io::stdout().lock());
+    if let Some(trace) = &args.coverage {
+        coverage::run(args, databases, trace, &mut out)?;
+    } else if args.warnings {
+        warnings(args, &databases, &mut out)?;
+    } else if args.messages.is_empty() {
+        list(args, &databases, &mut out)?;
+    } else {
+        describe::run(args, &databases, &mut out)?;
+    }
+    out.flush()?;
+    Ok(ExitCode::SUCCESS)
+}
+
+fn warnings(args: &Args, databases: &[Database], out: &mut impl Write) -> anyhow::Result<()> {
+    let all = databases
+        .iter()
+        .flat_map(|database| database.warnings.iter().map(move |warning| (database, warning)));
+    if args.json {
+        let warnings: Vec<_> = all
+            .map(|(database, warning)| {
+                json!({ "file": database.file, "line": warning.line, "symbol": warning.symbol, "warning": warning.kind.to_string() })
+            })
+            .collect();
+        return Ok(writeln!(out, "{}", json!({ "warnings": warnings }))?);
+    }
+    for (database, warning) in all {
+        writeln!(out, "{}: {warning}", database.file)?;
+    }
+    Ok(())
+}
+
+fn list(args: &Args, databases: &[Database], out: &mut impl Write) -> anyhow::Result<()> {
+    if args.json {
+        let files: Vec<_> = databases.iter().map(describe::database).collect();
+        return Ok(writeln!(out, "{}", json!({ "databases": files }))?);
+    }
+    for (at, database) in databases.iter().enumerate() {
+        if at > 0 {
+            writeln!(out)?;
+        }
+        let signals: usize = database.messages.iter().map(|message| message.signals.len()).sum();
+        let warnings = match database.warnings.len() {
+            0 => String::new(),
+            count => format!(", {} (--warnings lists them)", counted(count, "warning")),
+        };
+        writeln!(
+            out,
+            "{}: {}, {}{warnings}",
+            database.file,
+            counted(database.messages.len(), "message"),
+            counted(signals, "signal")
+        )?;
+        let names = database.messages.iter().map(|message| message.name.chars().count());
+        let width = names.max().unwrap_or(0).clamp(7, 40);
+        writeln!(
+            out,
+            "  {:<8} {:<width$} {:>5} {:>9} {:>7}  Comment",
+            "ID", "Message", "Bytes", "Cycle", "Signals"
+        )?;
+        for message in &database.messages {
+            let cycle = message.cycle_ms.map_or("–".to_owned(), |cycle| format!("{cycle} ms"));
+            let comment = message.description.lines().next().unwrap_or_default();
+            let line = format!(
+                "  {:<8} {:<width$} {:>5} {cycle:>9} {:>7}  {comment}",
+                message.id.to_string(),
+                message.name,
+                message.length,
+                message.signals.len()
+            );
+            writeln!(out, "{}", line.trim_end())?;
+        }
+    }
+    Ok(())
+}

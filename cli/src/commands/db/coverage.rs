@@ -1,0 +1,153 @@
+//! How databases suit a trace.
+
+use std::collections::HashMap;
+use std::io::Write;
+use std::path::Path;
+
+use cantap_analysis::stats::{IdStatistics, Options, Statistics};
+use cantap_signals::{Database, Decoder, MessageRef, Source};
+use serde_json::json;
+
+use super::Args;
+use crate::words::counted;
+
+/// A cycle counts as another one than the database says if it differs by more than this share.
+const TOLERANCE: f64 = 0.1;
+
+/// An identifier of the trace.
+struct Heard {
+    channel: u8,
+    id: String,
+    frames: u64,
+    mean_ms: Option<f64>,
+    max_ms: Option<f64>,
+}
+
+impl Heard {
+    fn of(channel: u8, id: &IdStatistics) -> Self {
+        Self {
+            channel,
+            id: id.id.to_string(),
+            frames: id.frames,
+            mean_ms: id.period.mean_ns().map(|ns| ns / 1e6),
+            max_ms: id.period.max_ns().map(|ns| ns as f64 / 1e6),
+        }
+    }
+}
+
+/// Compares and prints.
+pub fn run(args: &Args, databases: Vec<Database>, trace: &Path, out: &mut impl Write) -> anyhow::Result<()> {
+    let sources = databases.into_iter().map(|database| Source { channel: None, database });
+    let mut decoder = Decoder::new(sources.collect());
+    if args.j1939 {
+        decoder.assume_j1939();
+    }
+    let mut statistics = Statistics::new(Options::default())?;
+    let mut records = args.read.open(trace)?;
+    let mut batch = Vec::new();
+    while records.next_batch(&mut batch)? {
+        for record in &batch {
+            statistics.push(record);
+        }
+    }
+    let (mut known, mut unknown) = (Vec::new(), Vec::new());
+    let mut came: HashMap<MessageRef, u64> = HashMap::new();
+    let (mut frames, mut covered, mut unlisted) = (0, 0, 0);
+    for channel in statistics.channels() {
+        frames += channel.frames;
+        unlisted += channel.unlisted_frames();
+        for id in channel.ids() {
+            let heard = Heard::of(channel.number, id);
+            if let Some(message) = decoder.find(channel.number, id.id) {
+                covered += id.frames;
+                *came.entry(message).or_default() += id.frames;
+                known.push((heard, message));
+            } else {
+                unknown.push(heard);
+            }
+        }
+    }
+    known.sort_by(|(a, _), (b, _)| (a.channel, &a.id).cmp(&(b.channel, &b.id)));
+    unknown.sort_by_key(|heard| std::cmp::Reverse(heard.frames));
+    let all = decoder.messages();
+    let never: Vec<_> = all.filter(|(reference, ..)| !came.contains_key(reference)).collect();
+    let off = |heard: &Heard, message: MessageRef| {
+        let nominal = decoder.message(message).cycle_ms.map(f64::from)?;
+        let mean = heard.mean_ms?;
+        Some(((mean - nominal) / nominal).abs() > TOLERANCE)
+    };
+    if args.json {
+        let entry = |heard: &Heard| json!({ "channel": heard.channel, "id": heard.id, "frames": heard.frames, "period_mean_ms": heard.mean_ms, "period_max_ms": heard.max_ms });
+        let missing: Vec<_> = unknown.iter().map(entry).collect();
+        let silent: Vec<_> = never
+            .iter()
+            .map(|(_, _, message)| json!({ "id": message.id.to_string(), "message": message.name, "cycle_ms": message.cycle_ms }))
+            .collect();
+        let cycles: Vec<_> = known
+            .iter()
+            .map(|(heard, message)| {
+                let mut object = entry(heard);
+                object["message"] = decoder.message(*message).name.as_str().into();
+                object["cycle_ms"] = decoder.message(*message).cycle_ms.into();
+                object["cycle_differs"] = off(heard, *message).into();
+                object
+            })
+            .collect();
+        let object = json!({
+            "frames": frames, "covered": covered, "unlisted": unlisted,
+            "not_in_database": missing, "never_came": silent, "messages": cycles,
+        });
+        return Ok(writeln!(out, "{object}")?);
+    }
+    let share = if frames > 0 { covered as f64 * 100.0 / frames as f64 } else { 0.0 };
+    writeln!(out, "{covered} of {frames} frames are in the databases ({share:.1} %)")?;
+    if unlisted > 0 {
+        writeln!(out, "{unlisted} frames have identifiers beyond those that are followed one by one")?;
+    }
+    let ms = |value: Option<f64>| value.map_or("–".to_owned(), |value| format!("{value:.3}"));
+    writeln!(out, "\nNot in the databases: {}", counted(unknown.len(), "identifier"))?;
+    if !unknown.is_empty() {
+        writeln!(out, "  C {:<8} {:>9} {:>10} {:>10}", "ID", "frames", "mean ms", "max ms")?;
+    }
+    for heard in &unknown {
+        writeln!(
+            out,
+            "  {} {:<8} {:>9} {:>10} {:>10}",
+            heard.channel,
+            heard.id,
+            heard.frames,
+            ms(heard.mean_ms),
+            ms(heard.max_ms)
+        )?;
+    }
+    writeln!(out, "\nNever came: {} of {} messages", never.len(), decoder.messages().count())?;
+    for (_, _, message) in &never {
+        let cycle = message.cycle_ms.map_or(String::new(), |cycle| format!(", every {cycle} ms"));
+        writeln!(out, "  {:<8} {}{cycle}", message.id.to_string(), message.name)?;
+    }
+    writeln!(out, "\nCame: {}", counted(known.len(), "identifier"))?;
+    if !known.is_empty() {
+        let head = ["ID", "frames", "cycle ms", "mean ms", "max ms"];
+        writeln!(
+            out,
+            "  C {:<8} {:>9} {:>10} {:>10} {:>10}  Message",
+            head[0], head[1], head[2], head[3], head[4]
+        )?;
+    }
+    for (heard, message) in &known {
+        let described = decoder.message(*message);
+        writeln!(
+            out,
+            "  {} {:<8} {:>9} {:>10} {:>10} {:>10}  {}{}",
+            heard.channel,
+            heard.id,
+            heard.frames,
+            described.cycle_ms.map_or("–".to_owned(), |cycle| cycle.to_string()),
+            ms(heard.mean_ms),
+            ms(heard.max_ms),
+            described.name,
+            if off(heard, *message) == Some(true) { "  (another cycle than the database says)" } else { "" }
+        )?;
+    }
+    Ok(())
+}

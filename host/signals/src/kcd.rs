@@ -1,0 +1,167 @@
+//! Databases from KCD files, Kayak's XML.
+//!
+//! A bit offset counts, for big-endian signals, from the highest bit of the first byte on. All buses of a file are read; which
+//! of them a channel is, the file does not say.
+
+use cantap_wire::Id;
+use roxmltree::{Document, Node};
+
+use super::fault::{DatabaseError, Fault, FaultKind};
+use super::layout::{ByteOrder, wire_position};
+use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
+use super::{validate, xml};
+
+/// Parses a KCD file's content; `file` is its name for messages to the user.
+pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
+    let text = xml::decode(bytes);
+    let document = xml::parse(file, &text)?;
+    let root = document.root_element();
+    if root.tag_name().name() != "NetworkDefinition" {
+        let reason =
+            format!("its element is <{}>; a KCD file's is <NetworkDefinition>", root.tag_name().name());
+        return Err(xml::faulty(file, reason));
+    }
+    let mut faults = Vec::new();
+    let buses = root.children().filter(|node| node.has_tag_name_of("Bus"));
+    let nodes = buses.flat_map(|bus| bus.children().filter(|node| node.has_tag_name_of("Message")));
+    let messages = nodes.filter_map(|node| message(&document, node, &mut faults)).collect();
+    validate::finish(file, messages, faults)
+}
+
+/// Elements by local name: writers differ in what they do with the namespace.
+trait Local {
+    fn has_tag_name_of(&self, name: &str) -> bool;
+}
+
+impl Local for Node<'_, '_> {
+    fn has_tag_name_of(&self, name: &str) -> bool {
+        self.is_element() && self.tag_name().name() == name
+    }
+}
+
+fn child<'a, 'b>(node: Node<'a, 'b>, name: &str) -> Option<Node<'a, 'b>> {
+    node.children().find(|child| child.has_tag_name_of(name))
+}
+
+fn notes(node: Node) -> String {
+    child(node, "Notes").map(|notes| xml::text(notes).trim().to_owned()).unwrap_or_default()
+}
+
+fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<Message> {
+    let line = xml::line(document, node);
+    let name = node.attribute("name").unwrap_or_default().to_owned();
+    let mut fault = |kind| faults.push(Fault { line, symbol: name.clone(), kind });
+    let written = node.attribute("id").unwrap_or_default();
+    let Some(number) = xml::integer(written) else {
+        fault(FaultKind::Syntax(format!("the identifier {written:?} is no number")));
+        return None;
+    };
+    let extended = node.attribute("format") == Some("extended");
+    let raw = u32::try_from(number).ok();
+    let Some(id) = raw.and_then(|raw| if extended { Id::extended(raw) } else { Id::standard(raw) }) else {
+        fault(FaultKind::Id(number as u64));
+        return None;
+    };
+    let mut signals = Vec::new();
+    for part in node.children().filter(Node::is_element) {
+        let result = match part.tag_name().name() {
+            "Signal" => signal(document, part).map(|signal| signals.push(signal)),
+            "Multiplex" => multiplex(document, part, &mut signals),
+            _ => Ok(()),
+        };
+        if let Err(kind) = result {
+            let symbol = format!("{name}.{}", part.attribute("name").unwrap_or_default());
+            let is_usable = kind.is_warning();
+            faults.push(Fault { line: xml::line(document, part), symbol, kind });
+            if !is_usable {
+                return None;
+            }
+        }
+    }
+    let length = match node.attribute("length") {
+        None | Some("auto") => u64::from(signals.iter().map(Signal::bytes_needed).max().unwrap_or(0)),
+        Some(length) => length.parse().unwrap_or(u64::MAX),
+    };
+    let Some(length) = u16::try_from(length).ok().filter(|&length| length <= validate::MAX_BYTES) else {
+        faults.push(Fault { line, symbol: name, kind: FaultKind::MessageLength(length) });
+        return None;
+    };
+    let cycle_ms =
+        node.attribute("interval").and_then(|interval| interval.parse().ok()).filter(|&cycle| cycle > 0);
+    Some(Message { id, name, description: notes(node), length, cycle_ms, j1939: false, signals, line })
+}
+
+/// A multiplexer and the signals of its groups.
+fn multiplex(document: &Document, node: Node, signals: &mut Vec<Signal>) -> Result<(), FaultKind> {
+    let switch = signals.len();
+    signals.push(Signal { is_switch: true, ..signal(document, node)? });
+    for group in node.children().filter(|node| node.has_tag_name_of("MuxGroup")) {
+        let written = group.attribute("count").unwrap_or_default();
+        let value = xml::integer(written).and_then(|value| u64::try_from(value).ok());
+        let value =
+            value.ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is no number")))?;
+        for part in group.children().filter(|node| node.has_tag_name_of("Signal")) {
+            let multiplexed = Some(Multiplexed { switch, values: vec![value..=value] });
+            signals.push(Signal { multiplexed, ..signal(document, part)? });
+        }
+    }
+    Ok(())
+}
+
+fn signal(document: &Document, node: Node) -> Result<Signal, FaultKind> {
+    let number = |node: Node, name: &str, default: f64| match node.attribute(name) {
+        None => Ok(default),
+        Some(text) => text
+            .trim()
+            .parse::<f64>()
+            .map_err(|_| FaultKind::Syntax(format!("{name} = {text:?} is no number"))),
+    };
+    let name = node.attribute("name").unwrap_or_default();
+    let offset = number(node, "offset", 0.0)? as u64;
+    let length = match number(node, "length", 1.0)? as u64 {
+        0 => return Err(FaultKind::NoBits),
+        length @ 1..=64 => length as u16,
+        length => return Err(FaultKind::TooManyBits(length)),
+    };
+    let order = if node.attribute("endianess") == Some("big") { ByteOrder::Big } else { ByteOrder::Little };
+    let offset = u16::try_from(offset).ok().filter(|&offset| offset < validate::MAX_BYTES * 8);
+    let offset = offset.ok_or(FaultKind::Start(number(node, "offset", 0.0)? as u64))?;
+    let start = if order == ByteOrder::Big { wire_position(offset.into()) as u16 } else { offset };
+    let mut signal = Signal {
+        description: notes(node),
+        order,
+        line: xml::line(document, node),
+        ..Signal::new(name, start, length)
+    };
+    if let Some(value) = child(node, "Value") {
+        signal.kind = match (value.attribute("type"), length) {
+            (Some("signed"), _) => ValueKind::Signed,
+            (Some("single" | "double"), 16) => ValueKind::Half,
+            (Some("single"), _) | (Some("double"), 32) => ValueKind::Single,
+            (Some("double"), _) => ValueKind::Double,
+            _ => ValueKind::Unsigned,
+        };
+        signal.factor = number(value, "slope", 1.0)?;
+        signal.offset = number(value, "intercept", 0.0)?;
+        let limit = |name| value.attribute(name).map(|_| number(value, name, 0.0)).transpose();
+        (signal.min, signal.max) = (limit("min")?, limit("max")?);
+        value.attribute("unit").unwrap_or_default().clone_into(&mut signal.unit);
+    }
+    let labels = child(node, "LabelSet").into_iter().flat_map(|set| set.children().filter(Node::is_element));
+    let mut texts = Vec::new();
+    for label in labels {
+        let name = label.attribute("name").unwrap_or_default();
+        let value = |name: &str| {
+            label.attribute(name).and_then(xml::integer).and_then(|value| i64::try_from(value).ok())
+        };
+        match (label.tag_name().name(), value("value"), value("from"), value("to")) {
+            ("Label", Some(value), ..) => texts.push((value, name.to_owned())),
+            ("LabelGroup", _, Some(from), Some(to)) if from <= to && to - from < xml::MOST_TEXTS => {
+                texts.extend((from..=to).map(|value| (value, name.to_owned())));
+            }
+            _ => {}
+        }
+    }
+    signal.values = ValueTable::new(texts);
+    Ok(signal)
+}

@@ -1,0 +1,74 @@
+//! What the readers of XML databases share.
+
+use std::borrow::Cow;
+
+use roxmltree::{Document, Node, ParsingOptions};
+
+use super::fault::{DatabaseError, Fault, FaultKind};
+
+/// A range of values that one text stands for is written out up to so many of them.
+pub const MOST_TEXTS: i64 = 4096;
+
+/// The text of an XML file: UTF-8, UTF-16 with its mark, or else Windows' Western code page.
+pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
+    let units = |order: fn([u8; 2]) -> u16| -> Vec<u16> {
+        bytes[2..].chunks_exact(2).map(|pair| order([pair[0], pair[1]])).collect()
+    };
+    match bytes {
+        [0xFF, 0xFE, ..] => String::from_utf16_lossy(&units(u16::from_le_bytes)).into(),
+        [0xFE, 0xFF, ..] => String::from_utf16_lossy(&units(u16::from_be_bytes)).into(),
+        _ => super::dbc_text::decode(bytes),
+    }
+}
+
+/// Parses, or says where the text is no XML. A document type is read over: nothing is fetched, nothing expanded without bound.
+pub fn parse<'a>(file: &str, text: &'a str) -> Result<Document<'a>, DatabaseError> {
+    if text.trim().is_empty() {
+        return Err(faulty(
+            file,
+            "the file is empty; is it the right one, and was it copied to its end?".to_owned(),
+        ));
+    }
+    let options = ParsingOptions { allow_dtd: true, ..ParsingOptions::default() };
+    Document::parse_with_options(text, options).map_err(|error| {
+        let (line, kind) = (error.pos().row, FaultKind::Syntax(error.to_string()));
+        DatabaseError::Faulty {
+            file: file.to_owned(),
+            faults: vec![Fault { line, symbol: String::new(), kind }],
+        }
+    })
+}
+
+/// The error for a whole file.
+pub fn faulty(file: &str, reason: String) -> DatabaseError {
+    let fault = Fault { line: 0, symbol: String::new(), kind: FaultKind::Syntax(reason) };
+    DatabaseError::Faulty { file: file.to_owned(), faults: vec![fault] }
+}
+
+/// The line that an element begins in.
+pub fn line(document: &Document, node: Node) -> u32 {
+    document.text_pos_at(node.range().start).row
+}
+
+/// All text inside an element.
+pub fn text(node: Node) -> String {
+    node.descendants().filter(Node::is_text).filter_map(|node| node.text()).collect()
+}
+
+/// `12`, `-3`, `0x1F`, `0b11`; a float that is an integer, as some writers have it.
+pub fn integer(text: &str) -> Option<i128> {
+    let text = text.trim();
+    let (sign, digits) = text.strip_prefix('-').map_or((1, text), |digits| (-1, digits));
+    let lower = digits.to_ascii_lowercase();
+    let magnitude = if let Some(hex) = lower.strip_prefix("0x") {
+        i128::from_str_radix(hex, 16).ok()?
+    } else if let Some(binary) = lower.strip_prefix("0b") {
+        i128::from_str_radix(binary, 2).ok()?
+    } else if let Ok(value) = lower.parse() {
+        value
+    } else {
+        let value = lower.parse::<f64>().ok().filter(|value| value.fract() == 0.0 && value.abs() < 1e18)?;
+        value as i128
+    };
+    Some(sign * magnitude)
+}

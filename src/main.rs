@@ -34,13 +34,13 @@ mod app {
     use cantap_firmware::bus::queue::RecordQueue;
     use cantap_firmware::lights::Activity;
     use cantap_firmware::port::session::Session;
-    use cantap_firmware::ports::{Clock, FilterBanks};
+    use cantap_firmware::ports::FilterBanks;
     use cantap_wire::Channel;
 
     use stm32f4xx_hal::pac::Interrupt;
 
     use crate::hw::access::{Access, Controls, Tap};
-    use crate::hw::can::{Doorbell, TransmitBell};
+    use crate::hw::can::Bells;
     use crate::hw::stamp::StampTimer;
     use crate::hw::tick::Tick;
     use crate::hw::usb::{Memory, UsbPort};
@@ -51,6 +51,12 @@ mod app {
     struct Shared {
         /// Ceiling 4: what the tasks of priority 4 own.
         tap: Tap,
+        /// To be read at any priority.
+        stamp: StampTimer,
+        /// The switches of CAN1's interrupts.
+        can1_bells: Bells<0>,
+        /// The switches of CAN2's interrupts.
+        can2_bells: Bells<1>,
         /// When the interrupt stamped CAN1's last frame.
         can1_entered: AtomicU32,
         /// When the interrupt stamped CAN2's last frame.
@@ -74,21 +80,6 @@ mod app {
     struct Local {
         tick: Tick,
         watchdog: Watchdog,
-        can1_clock: StampTimer,
-        can2_clock: StampTimer,
-        can1_doorbell: Doorbell,
-        can2_doorbell: Doorbell,
-        can1_tx_bell: TransmitBell,
-        can2_tx_bell: TransmitBell,
-        can1_tx_reopener: TransmitBell,
-        can2_tx_reopener: TransmitBell,
-        can1_reopener: Doorbell,
-        can2_reopener: Doorbell,
-        can1_tx_clock: StampTimer,
-        can2_tx_clock: StampTimer,
-        can1_error_clock: StampTimer,
-        can2_error_clock: StampTimer,
-        alarm_clock: StampTimer,
     }
 
     #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
@@ -96,7 +87,7 @@ mod app {
         let hardware = hw::start(cx.device, cx.local.usb_memory);
         let Hardware {
             can,
-            stamp,
+            alarm,
             sof,
             tick,
             crc,
@@ -107,16 +98,17 @@ mod app {
             restarted_after_failure,
         } = hardware;
         chip.tick(Activity { error: restarted_after_failure, ..Activity::default() });
-        let [can1_doorbell, can2_doorbell] = can.doorbells;
-        let [can1_reopener, can2_reopener] = can.reopeners;
-        let [can1_tx_bell, can2_tx_bell] = can.transmit_bells;
-        let [can1_tx_reopener, can2_tx_reopener] = can.transmit_reopeners;
+        let (can1_bells, can2_bells) = can.bells;
+        let stamp = alarm.timer();
         let mut filters = can.filters;
         filters.write(&Layout::open());
         let (producer, consumer) = cx.local.records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, stamp },
+                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, alarm },
+                stamp,
+                can1_bells,
+                can2_bells,
                 can1_entered: AtomicU32::new(0),
                 can2_entered: AtomicU32::new(0),
                 can1_sent_at: AtomicU32::new(0),
@@ -125,25 +117,7 @@ mod app {
                 usb,
                 controls: Controls { can: can.control, filters, chip, stamp, sof, crc },
             },
-            Local {
-                tick,
-                watchdog,
-                can1_clock: stamp,
-                can2_clock: stamp,
-                can1_doorbell,
-                can2_doorbell,
-                can1_tx_bell,
-                can2_tx_bell,
-                can1_tx_reopener,
-                can2_tx_reopener,
-                can1_reopener,
-                can2_reopener,
-                can1_tx_clock: stamp,
-                can2_tx_clock: stamp,
-                can1_error_clock: stamp,
-                can2_error_clock: stamp,
-                alarm_clock: stamp,
-            },
+            Local { tick, watchdog },
         )
     }
 
@@ -151,18 +125,18 @@ mod app {
     ///
     /// Priority 5, the highest, and a dozen instructions: each microsecond of delay is one in the stamp. What can delay it is
     /// [`can2_rx0`] and the two transmit interrupts, a dozen instructions each.
-    #[task(binds = CAN1_RX0, priority = 5, local = [can1_clock, can1_doorbell], shared = [&can1_entered])]
+    #[task(binds = CAN1_RX0, priority = 5, shared = [&stamp, &can1_bells, &can1_entered])]
     fn can1_rx0(cx: can1_rx0::Context) {
-        cx.shared.can1_entered.store(cx.local.can1_clock.now(), Ordering::Relaxed);
-        cx.local.can1_doorbell.silence();
+        cx.shared.can1_entered.store(cx.shared.stamp.now(), Ordering::Relaxed);
+        cx.shared.can1_bells.silence_receive();
         rtic::pend(Interrupt::CAN1_RX1);
     }
 
     /// As [`can1_rx0`], for CAN2.
-    #[task(binds = CAN2_RX0, priority = 5, local = [can2_clock, can2_doorbell], shared = [&can2_entered])]
+    #[task(binds = CAN2_RX0, priority = 5, shared = [&stamp, &can2_bells, &can2_entered])]
     fn can2_rx0(cx: can2_rx0::Context) {
-        cx.shared.can2_entered.store(cx.local.can2_clock.now(), Ordering::Relaxed);
-        cx.local.can2_doorbell.silence();
+        cx.shared.can2_entered.store(cx.shared.stamp.now(), Ordering::Relaxed);
+        cx.shared.can2_bells.silence_receive();
         rtic::pend(Interrupt::DMA1_STREAM0);
     }
 
@@ -170,41 +144,41 @@ mod app {
     ///
     /// Priority 4: FIFO 0 holds three frames (RM0090 Rev 21 §32.7.3) and no frame is shorter than 47 µs at 1 Mbit/s,
     /// so starting later than 141 µs after the first loses the fourth. `otg_fs` (2) may wait: USB can NAK.
-    #[task(binds = CAN1_RX1, priority = 4, local = [can1_reopener], shared = [tap, &can1_entered])]
+    #[task(binds = CAN1_RX1, priority = 4, shared = [tap, &can1_bells, &can1_entered])]
     fn can1_drain(mut cx: can1_drain::Context) {
         let entered = cx.shared.can1_entered.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], stamp }| {
-            capture.on_receive(Channel::Can1, can1, stamp, entered);
+        cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], alarm }| {
+            capture.on_receive(Channel::Can1, can1, alarm, entered);
         });
-        cx.local.can1_reopener.open();
+        cx.shared.can1_bells.open_receive();
     }
 
     /// As [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
     /// FIFO 1 is above those of the tasks that send, which would then go first.
-    #[task(binds = DMA1_STREAM0, priority = 4, local = [can2_reopener], shared = [tap, &can2_entered])]
+    #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
         let entered = cx.shared.can2_entered.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], stamp }| {
-            capture.on_receive(Channel::Can2, can2, stamp, entered);
+        cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], alarm }| {
+            capture.on_receive(Channel::Can2, can2, alarm, entered);
         });
-        cx.local.can2_reopener.open();
+        cx.shared.can2_bells.open_receive();
     }
 
     /// Stamps the end of a transmission on CAN1, and leaves the mailbox to [`can1_sent`].
     ///
     /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp is as good as a frame's.
-    #[task(binds = CAN1_TX, priority = 5, local = [can1_tx_clock, can1_tx_bell], shared = [&can1_sent_at])]
+    #[task(binds = CAN1_TX, priority = 5, shared = [&stamp, &can1_bells, &can1_sent_at])]
     fn can1_tx(cx: can1_tx::Context) {
-        cx.shared.can1_sent_at.store(cx.local.can1_tx_clock.now(), Ordering::Relaxed);
-        cx.local.can1_tx_bell.silence();
+        cx.shared.can1_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);
+        cx.shared.can1_bells.silence_transmit();
         rtic::pend(Interrupt::USART2);
     }
 
     /// As [`can1_tx`], for CAN2.
-    #[task(binds = CAN2_TX, priority = 5, local = [can2_tx_clock, can2_tx_bell], shared = [&can2_sent_at])]
+    #[task(binds = CAN2_TX, priority = 5, shared = [&stamp, &can2_bells, &can2_sent_at])]
     fn can2_tx(cx: can2_tx::Context) {
-        cx.shared.can2_sent_at.store(cx.local.can2_tx_clock.now(), Ordering::Relaxed);
-        cx.local.can2_tx_bell.silence();
+        cx.shared.can2_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);
+        cx.shared.can2_bells.silence_transmit();
         rtic::pend(Interrupt::USART3);
     }
 
@@ -212,41 +186,41 @@ mod app {
     ///
     /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
     /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
-    #[task(binds = USART2, priority = 4, local = [can1_tx_reopener], shared = [tap, &can1_sent_at])]
+    #[task(binds = USART2, priority = 4, shared = [tap, &can1_bells, &can1_sent_at])]
     fn can1_sent(mut cx: can1_sent::Context) {
         let entered = cx.shared.can1_sent_at.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| {
-            capture.on_transmit(Channel::Can1, traffic, stamp, entered);
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            capture.on_transmit(Channel::Can1, traffic, alarm, entered);
         });
-        cx.local.can1_tx_reopener.open();
+        cx.shared.can1_bells.open_transmit();
     }
 
     /// As [`can1_sent`], for CAN2, with USART3.
-    #[task(binds = USART3, priority = 4, local = [can2_tx_reopener], shared = [tap, &can2_sent_at])]
+    #[task(binds = USART3, priority = 4, shared = [tap, &can2_bells, &can2_sent_at])]
     fn can2_sent(mut cx: can2_sent::Context) {
         let entered = cx.shared.can2_sent_at.load(Ordering::Relaxed);
-        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| {
-            capture.on_transmit(Channel::Can2, traffic, stamp, entered);
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            capture.on_transmit(Channel::Can2, traffic, alarm, entered);
         });
-        cx.local.can2_tx_reopener.open();
+        cx.shared.can2_bells.open_transmit();
     }
 
     /// Records CAN1's errors and changes of state.
     ///
     /// Priority 4, because it writes records. The controller keeps one error: a second one before this starts, at least
     /// 14 bits later, replaces it uncounted.
-    #[task(binds = CAN1_SCE, priority = 4, local = [can1_error_clock], shared = [tap])]
+    #[task(binds = CAN1_SCE, priority = 4, shared = [tap, &stamp])]
     fn can1_sce(mut cx: can1_sce::Context) {
-        let entered = cx.local.can1_error_clock.now();
+        let entered = cx.shared.stamp.now();
         cx.shared.tap.lock(|Tap { capture, traffic: [can1, _], .. }| {
             capture.on_error(Channel::Can1, can1, entered);
         });
     }
 
     /// As [`can1_sce`], for CAN2.
-    #[task(binds = CAN2_SCE, priority = 4, local = [can2_error_clock], shared = [tap])]
+    #[task(binds = CAN2_SCE, priority = 4, shared = [tap, &stamp])]
     fn can2_sce(mut cx: can2_sce::Context) {
-        let entered = cx.local.can2_error_clock.now();
+        let entered = cx.shared.stamp.now();
         cx.shared.tap.lock(|Tap { capture, traffic: [_, can2], .. }| {
             capture.on_error(Channel::Can2, can2, entered);
         });
@@ -255,10 +229,12 @@ mod app {
     /// Sends what is due.
     ///
     /// Priority 4, because it writes mailboxes and records. Each microsecond of delay is one that a frame leaves late.
-    #[task(binds = TIM2, priority = 4, local = [alarm_clock], shared = [tap])]
+    #[task(binds = TIM2, priority = 4, shared = [tap])]
     fn tim2(mut cx: tim2::Context) {
-        cx.local.alarm_clock.acknowledge();
-        cx.shared.tap.lock(|Tap { capture, traffic, stamp }| capture.on_alarm(traffic, stamp));
+        cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            alarm.acknowledge();
+            capture.on_alarm(traffic, alarm);
+        });
     }
 
     /// Talks to the host.
@@ -283,8 +259,8 @@ mod app {
         cx.local.watchdog.feed();
         // One short lock each, so that the transmission alarm can come between them.
         for channel in Channel::ALL {
-            tap.lock(|Tap { capture, traffic, stamp }| {
-                capture.on_channel_tick(channel, &mut traffic[channel.index()], stamp);
+            tap.lock(|Tap { capture, traffic, alarm }| {
+                capture.on_channel_tick(channel, &mut traffic[channel.index()], alarm);
             });
         }
         let activity = tap.lock(|Tap { capture, .. }| capture.take_activity());

@@ -59,6 +59,10 @@ pub trait Traffic {
     /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the
     /// oldest and drops the newest.
     fn take_overrun(&mut self) -> bool;
+    /// [`Self::pending`] and [`Self::take_overrun`] at one look.
+    fn look(&mut self) -> (u8, bool) {
+        (self.pending(), self.take_overrun())
+    }
     /// Writes a frame to a free mailbox, where it waits for [`Self::request`] or is overwritten by the next. Returns the
     /// mailbox, a number below [`crate::bus::mailboxes::MAILBOXES`], or `None` if all are taken.
     fn prepare(&mut self, frame: &Frame) -> Option<u8>;

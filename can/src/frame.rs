@@ -139,8 +139,11 @@ impl Frame {
 #[inline]
 pub fn first(len: usize, data: [u8; 8]) -> [u8; 8] {
     // Shifts rather than a copy, which is a call where the length is not known.
-    let kept = if len >= 8 { u64::MAX } else { (1 << (8 * len)) - 1 };
-    (u64::from_le_bytes(data) & kept).to_le_bytes()
+    match len {
+        0 => [0; 8],
+        1..8 => (u64::from_le_bytes(data) & ((1 << (8 * len)) - 1)).to_le_bytes(),
+        _ => data,
+    }
 }
 
 impl fmt::Display for Frame {

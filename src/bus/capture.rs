@@ -80,8 +80,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         let mut first = true;
         let mut reply = false;
         loop {
-            let pending = traffic.pending();
-            let overrun = traffic.take_overrun();
+            let (pending, overrun) = traffic.look();
             if pending == 0 && !overrun {
                 break;
             }

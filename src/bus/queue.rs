@@ -85,7 +85,12 @@ impl<const N: usize> Producer<'_, N> {
     /// Whether a frame would be taken now. Once full, not before much is free.
     #[inline]
     pub fn takes_frames(&mut self) -> bool {
-        let free = (N as u32).saturating_sub(self.fill());
+        self.has_room_beside(self.fill())
+    }
+
+    #[inline]
+    fn has_room_beside(&mut self, fill: u32) -> bool {
+        let free = (N as u32).saturating_sub(fill);
         self.full = free < if self.full { RESUME_FREE } else { RESERVE };
         !self.full
     }
@@ -93,7 +98,8 @@ impl<const N: usize> Producer<'_, N> {
     /// Lets `encode` write one record in place. Returns false, without a call, if there is no room.
     #[inline]
     pub fn push(&mut self, kind: Kind, encode: impl FnOnce(&mut [u8; MAX_RECORD]) -> usize) -> bool {
-        if kind == Kind::Frame && !self.takes_frames() {
+        let fill = self.fill();
+        if kind == Kind::Frame && !self.has_room_beside(fill) {
             return false;
         }
         let Ok(mut grant) = self.ring.grant_exact(MAX_RECORD) else {
@@ -104,7 +110,8 @@ impl<const N: usize> Producer<'_, N> {
         let len = encode(room);
         grant.commit(len);
         self.written = self.written.wrapping_add(len as u32);
-        self.high_water = self.high_water.max(self.fill());
+        // The reader may have taken some since: one look at it for each record is enough.
+        self.high_water = self.high_water.max(fill + len as u32);
         true
     }
 }

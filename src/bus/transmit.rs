@@ -212,9 +212,12 @@ impl Transmitter {
     /// A frame was received: arms the replies that it asks for. Returns whether there is one.
     #[inline]
     pub fn on_frame(&mut self, frame: &Frame) -> bool {
-        if !self.triggers_armed {
-            return false;
-        }
+        self.triggers_armed && self.arm_replies(frame)
+    }
+
+    /// Apart from [`Self::on_frame`], and out of line: where no replies are set, the loop that drains has the registers to itself.
+    #[inline(never)]
+    fn arm_replies(&mut self, frame: &Frame) -> bool {
         for trigger in self.triggers.iter_mut().flatten() {
             if trigger.left != Some(0) && !trigger.waiting && trigger.entry.filter.matches(frame) {
                 trigger.waiting = true;

@@ -4,7 +4,6 @@ use cantap_firmware::QUEUE_BYTES;
 use cantap_firmware::bus::capture::Capture;
 use cantap_firmware::bus::sof::SofReading;
 use cantap_firmware::port::board::Board;
-use cantap_firmware::ports::Clock;
 use cantap_wire::{CHANNELS, Channel};
 use rtic::Mutex;
 
@@ -12,7 +11,7 @@ use super::can::{CanControl, CanFilters, CanTraffic};
 use super::chip::BoardChip;
 use super::crc::CrcUnit;
 use super::sof::SofLatch;
-use super::stamp::StampTimer;
+use super::stamp::{StampAlarm, StampTimer};
 
 /// What the tasks of priority 4 own.
 pub struct Tap {
@@ -20,8 +19,8 @@ pub struct Tap {
     pub capture: Capture<'static>,
     /// The controllers' traffic halves.
     pub traffic: [CanTraffic; CHANNELS],
-    /// The stamp timer, whose alarm is set only from here.
-    pub stamp: StampTimer,
+    /// The stamp timer with its alarm.
+    pub alarm: StampAlarm,
 }
 
 /// What commands own.
@@ -51,15 +50,15 @@ pub struct Access<'a, T> {
 impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
     type Traffic = CanTraffic;
     type Control = CanControl;
-    type Clock = StampTimer;
+    type Clock = StampAlarm;
     type Filters = CanFilters;
     type Chip = BoardChip;
 
     fn with_capture<R>(
         &mut self,
-        act: impl FnOnce(&mut Capture<'static>, &mut [CanTraffic; CHANNELS], &StampTimer) -> R,
+        act: impl FnOnce(&mut Capture<'static>, &mut [CanTraffic; CHANNELS], &StampAlarm) -> R,
     ) -> R {
-        self.tap.lock(|tap| act(&mut tap.capture, &mut tap.traffic, &tap.stamp))
+        self.tap.lock(|tap| act(&mut tap.capture, &mut tap.traffic, &tap.alarm))
     }
 
     fn now(&self) -> u32 {

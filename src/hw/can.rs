@@ -32,14 +32,8 @@ pub struct Controllers {
     pub control: [CanControl; CHANNELS],
     /// For commands.
     pub filters: CanFilters,
-    /// For the interrupts that stamp, one each.
-    pub doorbells: [Doorbell; CHANNELS],
-    /// For the tasks that drain, one each.
-    pub reopeners: [Doorbell; CHANNELS],
-    /// For the interrupts that stamp transmissions, one each.
-    pub transmit_bells: [TransmitBell; CHANNELS],
-    /// For the tasks that confirm, one each.
-    pub transmit_reopeners: [TransmitBell; CHANNELS],
+    /// For the interrupts that stamp, and the tasks that they raise.
+    pub bells: (Bells<0>, Bells<1>),
 }
 
 impl Controllers {
@@ -57,18 +51,14 @@ impl Controllers {
             traffic: blocks.map(CanTraffic::new),
             control,
             filters: CanFilters { can1: Registers(CAN1::ptr()) },
-            doorbells: blocks.map(|can| Doorbell { can }),
-            reopeners: blocks.map(|can| Doorbell { can }),
-            transmit_bells: blocks.map(|can| TransmitBell { can }),
-            transmit_reopeners: blocks.map(|can| TransmitBell { can }),
+            bells: (Bells(()), Bells(())),
         }
     }
 }
 
-/// Bits of IER: transmit mailbox empty, FIFO 0 message pending, FIFO 0 overrun (RM0090, CAN_IER).
+/// Bits of IER: transmit mailbox empty, FIFO 0 message pending (RM0090, CAN_IER).
 const TMEIE: usize = 0;
 const FMPIE0: usize = 1;
-const FOVIE0: usize = 3;
 
 /// A controller's registers.
 #[derive(Clone, Copy)]
@@ -77,20 +67,6 @@ struct Registers(*const RegisterBlock);
 // SAFETY: the registers are there for the whole program, wherever it touches them from. What the halves that hold
 // copies of the pointer write is disjoint, as their docs say.
 unsafe impl Send for Registers {}
-
-impl Registers {
-    /// Sets or clears one bit of IER, leaving the others as they are at that moment (Cortex-M4 technical reference manual,
-    /// "Bit-banding"): an interrupt between reading and writing a whole register would be undone.
-    #[inline]
-    fn set_ier_bit(&self, bit: usize, on: bool) {
-        const PERIPHERALS: usize = 0x4000_0000;
-        const ALIAS: usize = 0x4200_0000;
-        let register = self.ier().as_ptr() as usize;
-        let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
-        // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
-        unsafe { alias.write_volatile(u32::from(on)) };
-    }
-}
 
 impl Deref for Registers {
     type Target = RegisterBlock;
@@ -102,51 +78,63 @@ impl Deref for Registers {
     }
 }
 
-/// The switch of a controller's receive interrupt. The interrupt silences it and leaves the FIFO to a task of lower
-/// priority, which switches it on again when the FIFO is empty. [`TransmitBell`] is another switch in the same register, at
-/// other moments: so each changes its bits through the bit-band alias, one at a time and untorn. Commands write the
-/// register only while the controller is off the bus.
-pub struct Doorbell {
-    can: Registers,
-}
+/// The switches of a controller's receive and transmit interrupts: `CAN` is 0 or 1. Each interrupt only stamps, silences itself and leaves
+/// the rest to a task of lower priority, which switches it on again.
+///
+/// Both tasks and both interrupts share these. The switches are bits of one register, each changed through its bit-band alias (Cortex-M4
+/// technical reference manual, "Bit-banding"), one at a time and untorn: an interrupt between reading and writing the whole register
+/// would be undone. Commands write the register only while the controller is off the bus.
+///
+/// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it interrupt.
+pub struct Bells<const CAN: usize>(());
 
-impl Doorbell {
-    /// Ends the interrupt though frames are waiting.
+impl<const CAN: usize> Bells<CAN> {
     #[inline]
-    pub fn silence(&self) {
-        self.can.set_ier_bit(FMPIE0, false);
-        self.can.set_ier_bit(FOVIE0, false);
-        // Read back, so that the line has fallen before the interrupt returns.
-        self.can.ier().read();
+    fn registers() -> &'static RegisterBlock {
+        let block = if CAN == 0 { CAN1::ptr() } else { CAN2::ptr() };
+        // SAFETY: the registers are there for the whole program, and `Controllers::new`, which makes the only bells, took them.
+        unsafe { &*block }
     }
 
-    /// Interrupts again: at once if a frame is waiting.
     #[inline]
-    pub fn open(&self) {
-        self.can.set_ier_bit(FOVIE0, true);
-        self.can.set_ier_bit(FMPIE0, true);
-    }
-}
-
-/// The switch of a controller's transmit interrupt, as [`Doorbell`] is the receive interrupt's: off from the stamp until
-/// the mailboxes have been looked after.
-pub struct TransmitBell {
-    can: Registers,
-}
-
-impl TransmitBell {
-    /// Ends the interrupt though a mailbox has finished.
-    #[inline]
-    pub fn silence(&self) {
-        self.can.set_ier_bit(TMEIE, false);
-        // Read back, so that the line has fallen before the interrupt returns.
-        self.can.ier().read();
+    fn switch(bit: usize, on: bool) {
+        const PERIPHERALS: usize = 0x4000_0000;
+        const ALIAS: usize = 0x4200_0000;
+        let register = Self::registers().ier().as_ptr() as usize;
+        let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
+        // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
+        unsafe { alias.write_volatile(u32::from(on)) };
     }
 
-    /// Interrupts again: at once if a mailbox has finished.
+    /// Silenced bells are read back, so that the line has fallen before the interrupt returns.
     #[inline]
-    pub fn open(&self) {
-        self.can.set_ier_bit(TMEIE, true);
+    fn silence(bit: usize) {
+        Self::switch(bit, false);
+        Self::registers().ier().read();
+    }
+
+    /// Ends the receive interrupt though frames are waiting.
+    #[inline]
+    pub fn silence_receive(&self) {
+        Self::silence(FMPIE0);
+    }
+
+    /// Interrupts again on a frame: at once if one is waiting.
+    #[inline]
+    pub fn open_receive(&self) {
+        Self::switch(FMPIE0, true);
+    }
+
+    /// Ends the transmit interrupt though a mailbox has finished.
+    #[inline]
+    pub fn silence_transmit(&self) {
+        Self::silence(TMEIE);
+    }
+
+    /// Interrupts again on a finished mailbox: at once if one is waiting.
+    #[inline]
+    pub fn open_transmit(&self) {
+        Self::switch(TMEIE, true);
     }
 }
 
@@ -186,11 +174,13 @@ impl Traffic for CanTraffic {
     fn receive(&mut self) -> Option<Frame> {
         let fifo = self.can.rf0r();
         // While a frame is being released, the mailbox still shows it.
+        let mut status = fifo.read();
         let mut reads = RELEASE_READS;
-        while fifo.read().rfom().bit() && reads > 0 {
+        while status.rfom().bit() && reads > 0 {
+            status = fifo.read();
             reads -= 1;
         }
-        if fifo.read().fmp().bits() == 0 {
+        if status.fmp().bits() == 0 {
             return None;
         }
         let mailbox = self.can.rx(0);
@@ -202,6 +192,16 @@ impl Traffic for CanTraffic {
 
         let data = (u64::from(high) << 32 | u64::from(low)).to_le_bytes();
         Some(Frame::from_bus(received_id(&rir), rir.rtr().is_remote(), dlc, data))
+    }
+
+    #[inline]
+    fn look(&mut self) -> (u8, bool) {
+        let status = self.can.rf0r().read();
+        let overrun = status.fovr().is_overrun();
+        if overrun {
+            self.can.rf0r().write(|w| w.fovr().clear());
+        }
+        (status.fmp().bits(), overrun)
     }
 
     #[inline]
@@ -424,7 +424,7 @@ impl Control for CanControl {
             w.txfp().set_bit()
         });
         self.can.ier().modify(|_, w| {
-            w.fmpie0().set_bit().fovie0().set_bit().tmeie().set_bit();
+            w.fmpie0().set_bit().tmeie().set_bit();
             w.errie().set_bit().lecie().set_bit();
             w.ewgie().set_bit().epvie().set_bit().bofie().set_bit()
         });

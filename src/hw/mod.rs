@@ -5,6 +5,7 @@ pub mod access;
 pub mod can;
 pub mod chip;
 mod clocks;
+mod copy;
 pub mod crc;
 mod entry;
 mod failure;
@@ -35,8 +36,8 @@ static CANTAP_PROTOCOL_VERSION: u16 = cantap_wire::PROTOCOL_VERSION;
 pub struct Hardware {
     /// Both CAN controllers.
     pub can: can::Controllers,
-    /// The stamp timer.
-    pub stamp: stamp::StampTimer,
+    /// The stamp timer with its alarm.
+    pub alarm: stamp::StampAlarm,
     /// Its latch of USB's start of frame.
     pub sof: sof::SofLatch,
     /// The millisecond tick.
@@ -79,11 +80,11 @@ pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> 
     let serial = chip::serial_number();
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
     stay_in_reach_of_a_debugger(&device.DBGMCU);
-    let stamp = stamp::StampTimer::start(device.TIM2, &mut rcc);
+    let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
     Hardware {
         can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc),
-        stamp,
-        sof: sof::SofLatch::start(stamp),
+        sof: sof::SofLatch::start(alarm.timer()),
+        alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),
         usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),

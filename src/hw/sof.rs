@@ -5,7 +5,6 @@
 //! no interrupt takes part.
 
 use cantap_firmware::bus::sof::SofReading;
-use cantap_firmware::ports::Clock;
 use stm32f4xx_hal::pac::OTG_FS_DEVICE;
 
 use super::stamp::StampTimer;
@@ -15,29 +14,31 @@ pub struct SofLatch(StampTimer);
 
 impl SofLatch {
     /// Latches from now on.
-    pub fn start(timer: StampTimer) -> Self {
+    pub fn start(stamp: StampTimer) -> Self {
+        let timer = stamp.registers();
         timer.or().write(|w| w.itr1_rmp().otg_fs_sof());
         timer.smcr().write(|w| w.ts().itr1());
         // The source can be chosen while the channel is off only.
         timer.ccmr2_input().write(|w| w.cc4s().trc());
         timer.ccer().modify(|_, w| w.cc4e().enabled());
-        Self(timer)
+        Self(stamp)
     }
 
     /// What came since the last call.
     pub fn take(&mut self) -> Option<SofReading> {
-        let status = self.0.sr().read();
+        let timer = self.0.registers();
+        let status = timer.sr().read();
         if !status.cc4if().bit() {
             return None;
         }
         // The first reading clears the flag.
-        let before = self.0.ccr4().read().bits();
+        let before = timer.ccr4().read().bits();
         let frame = usb().dsts().read().fnsof().bits() & 0x7FF;
-        let after = self.0.ccr4().read().bits();
+        let after = timer.ccr4().read().bits();
         let several = status.cc4of().bit();
         if several {
             // Flags are cleared by writing 0; the others, the alarm's with them, are left alone.
-            self.0.sr().write(|w| w.cc4of().clear());
+            timer.sr().write(|w| w.cc4of().clear());
         }
         Some(SofReading { latched: [before, after], frame, now: self.0.now(), several })
     }

@@ -261,16 +261,24 @@ fn encode_long_ticks(ticks: i64, out: &mut [u8]) -> usize {
     postcard::to_slice(&ticks, out).map_or(0, |written| written.len())
 }
 
-/// postcard's `i64`, with what follows it.
-#[inline]
+/// postcard's `i64`, with what follows it. Always inline: a call would hand the result over in memory, for each record that the device
+/// packs.
+#[inline(always)]
+#[expect(clippy::inline_always, reason = "measured: a tenth of the time for packing")]
 fn decode_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
     // One and two bytes are nearly all there is; postcard takes the rest.
     let (zigzag, rest) = match *bytes {
         [a, ref rest @ ..] if a < 0x80 => (u32::from(a), rest),
         [a, b, ref rest @ ..] if b < 0x80 => (u32::from(a & 0x7F) | u32::from(b) << 7, rest),
-        _ => return postcard::take_from_bytes(bytes).map_err(|_| BadRecord),
+        _ => return decode_long_ticks(bytes),
     };
     Ok((i64::from((zigzag >> 1) as i32 ^ -((zigzag & 1) as i32)), rest))
+}
+
+#[cold]
+#[inline(never)]
+fn decode_long_ticks(bytes: &[u8]) -> Result<(i64, &[u8]), BadRecord> {
+    postcard::take_from_bytes(bytes).map_err(|_| BadRecord)
 }
 
 /// Reads one record: the record, its time difference in ticks, and what follows it.

@@ -169,6 +169,8 @@ fn remaps(shell: &Shell, sysroot: &Path) -> Result<String> {
     }
     flags.push(remap(&library, "/rust"));
     flags.push(remap(&shell.current_dir(), "/cantap"));
+    // Both chips' core, for which the target's code is not arranged by itself.
+    flags.push("-Ctarget-cpu=cortex-m4".to_owned());
     Ok(flags.join("\x1f"))
 }
 

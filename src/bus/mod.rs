@@ -4,7 +4,7 @@
 //! commands: that is [`crate::port`].
 
 pub mod capture;
-mod checksum;
+pub mod checksum;
 pub mod errors;
 pub mod filters;
 pub mod mailboxes;

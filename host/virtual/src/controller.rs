@@ -220,6 +220,11 @@ impl Node for Controller {
         self.takes_part() && self.mode().is_some_and(Mode::transmits) || self.is_looped()
     }
 
+    fn destroys(&self) -> bool {
+        let is_active = matches!(self.state(), ErrorState::Active | ErrorState::Warning);
+        self.takes_part() && is_active && self.mode() == Some(Mode::Normal)
+    }
+
     fn on_start(&mut self) {
         self.sending = true;
         self.driven += u64::from(self.mode() != Some(Mode::SilentLoopback));
@@ -258,8 +263,7 @@ impl Node for Controller {
             return;
         }
         // An error-active controller's flag is dominant.
-        let is_active = matches!(self.state(), ErrorState::Active | ErrorState::Warning);
-        self.driven += u64::from(is_active && self.mode() == Some(Mode::Normal));
+        self.driven += u64::from(self.destroys());
         self.count_error(kind, own);
         if own {
             self.sending = false;

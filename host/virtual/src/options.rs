@@ -8,12 +8,16 @@ use std::time::Duration;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Frame};
 
+use crate::car::{self, CarBus};
 use crate::simbus::{FrameSource, Frames, Schedule, SimBus, Traffic};
 
 /// A crystal is not off by more than this; a USB host's frames may not be either (USB 2.0, 7.1.12: 500 ppm).
 const MOST_PPM: f64 = 500.0;
 /// As long as a serial number can be.
 const MAX_SERIAL_BYTES: usize = 24;
+
+/// What a car on the bus leaves no room for.
+const MADE_UP: [&str; 5] = ["load", "frames", "bitrate", "burst", "wire"];
 
 /// How model time passes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -27,7 +31,7 @@ pub enum Pace {
 
 /// The simulated buses, their traffic, and the pace.
 ///
-/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `load` (per cent), `frames` (`std0` `std8` `ext0`
+/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `load` (per cent), `frames` (`std0` `std8` `ext0`
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
 /// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (so many of the frames that the device
 /// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device
@@ -64,6 +68,8 @@ pub struct Options {
     pub crystal_ppm: f64,
     /// The serial number that the device tells, at most 24 bytes.
     pub serial: String,
+    /// A vehicle on the buses, at its own bit rates: see [`crate::car`].
+    pub car: bool,
     /// Frames to be replayed at their own times (nanoseconds since the start), in place of made-up ones, per channel.
     pub log: Option<[Vec<(u64, Frame)>; CHANNELS]>,
 }
@@ -85,6 +91,7 @@ impl Default for Options {
             traffic_on: [true; CHANNELS],
             crystal_ppm: 0.0,
             serial: "VIRTUAL".to_owned(),
+            car: false,
             log: None,
         }
     }
@@ -96,7 +103,7 @@ impl Default for Options {
 pub enum BadOption {
     /// There is no such key.
     #[error(
-        "there is no option '{0}'; there are load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
+        "there is no option '{0}'; there are car, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
     )]
     Unknown(String),
     /// The value does not fit.
@@ -117,6 +124,7 @@ impl FromStr for Options {
     /// An empty text means the defaults.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut options = Self::default();
+        let mut made_up = None;
         // A file's name may have commas: it takes the rest.
         let (text, log) = match text.strip_prefix("log=") {
             Some(file) => ("", Some(file)),
@@ -128,8 +136,19 @@ impl FromStr for Options {
         for option in text.split(',').filter(|option| !option.is_empty()) {
             let (key, value) = option.split_once('=').unwrap_or((option, ""));
             options.set(key, value)?;
+            if MADE_UP.contains(&key) {
+                made_up = Some(option);
+            }
         }
-        Ok(options)
+        match made_up {
+            _ if !options.car => Ok(options),
+            None if options.log.is_none() => Ok(options),
+            option => Err(BadOption::Value {
+                key: "car".to_owned(),
+                value: option.unwrap_or("log").to_owned(),
+                reason: "the car has its own traffic and bit rates; leave out one of the two".to_owned(),
+            }),
+        }
     }
 }
 
@@ -147,6 +166,8 @@ impl Options {
                 .ok_or_else(|| bad(&"give per cent, 0 to 100"))
         };
         match key {
+            "car" if value.is_empty() => self.car = true,
+            "car" => return Err(bad(&"it stands alone")),
             "load" => self.load_percent = percent()?,
             "errors" => self.error_percent = percent()?,
             "frames" => self.frames = value.parse().map_err(|error| bad(&error))?,
@@ -197,11 +218,17 @@ impl Options {
         FrameSource::new(self.frames, self.seed.wrapping_mul(2).wrapping_add(channel as u64))
     }
 
+    /// The bit rate of a channel's bus in bit/s, if it has one of its own.
+    pub fn bitrate_of_bus(&self, channel: usize) -> Option<u32> {
+        if self.car { car::BITRATES_BPS.get(channel).copied() } else { self.bitrate_bps }
+    }
+
     /// A channel's bus.
     pub(super) fn bus(&mut self, channel: usize) -> SimBus {
         let log = self.log.as_mut().map(|log| std::mem::take(&mut log[channel]));
         let schedule = match (log, self.burst) {
             _ if !self.traffic_on[channel] => Schedule::Silent,
+            _ if self.car => Schedule::Nodes(Box::new(CarBus::new(channel, self.seed))),
             (Some(entries), _) => Schedule::Log { entries: entries.into_iter() },
             (None, Some((length, period))) => {
                 Schedule::Bursts { source: self.source(channel), length, period_ns: period.as_nanos() as u64 }
@@ -209,7 +236,7 @@ impl Options {
             (None, None) if self.load_percent <= 0.0 => Schedule::Silent,
             (None, None) => Schedule::Load { source: self.source(channel), percent: self.load_percent },
         };
-        SimBus::new(self.bitrate_bps, Traffic::new(schedule), self.seed)
+        SimBus::new(self.bitrate_of_bus(channel), Traffic::new(schedule), self.seed)
             .acknowledging(self.acknowledge)
             .with_errors(self.error_percent)
             .disturbing(self.disturb)
@@ -268,6 +295,11 @@ mod tests {
         );
         for (text, message) in [
             ("speed=1", "there is no option 'speed'"),
+            ("car=red", "'red' does not fit the option 'car': it stands alone"),
+            (
+                "car,load=5",
+                "'load=5' does not fit the option 'car': the car has its own traffic and bit rates",
+            ),
             ("load=101", "'101' does not fit the option 'load': give per cent, 0 to 100"),
             ("frames=x", "'x' does not fit the option 'frames': choose one of std0"),
             ("serial=", "'' does not fit the option 'serial': give 1 to 24 characters"),

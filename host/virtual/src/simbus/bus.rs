@@ -1,6 +1,6 @@
 //! The bus: one frame at a time, the lowest identifier first.
 
-use cantap_wire::Frame;
+use cantap_wire::{Frame, Id};
 use cantap_wire::record::BusErrorKind;
 
 use super::Traffic;
@@ -22,6 +22,8 @@ pub trait Node {
     fn bid(&self) -> Option<Frame>;
     /// Whether it acknowledges others' frames.
     fn acknowledges(&self) -> bool;
+    /// Whether others' frames are destroyed by its error flags when it cannot read them.
+    fn destroys(&self) -> bool;
     /// Its bid has won the bus: from now on it cannot be withdrawn.
     fn on_start(&mut self);
     /// Its bid has lost to a lower identifier.
@@ -99,8 +101,8 @@ impl SimBus {
                 if nodes.iter().any(|node| node.bid().is_some()) {
                     return from_ns.max(now_ns);
                 }
-                let due = self.traffic.peek(from_ns.max(now_ns), bitrate_bps);
-                due.map_or(NEVER, |(at_ns, _)| at_ns.max(from_ns))
+                let due = self.traffic.due(from_ns.max(now_ns), bitrate_bps);
+                due.map_or(NEVER, |at_ns| at_ns.max(from_ns))
             }
         }
     }
@@ -110,7 +112,7 @@ impl SimBus {
         match self.phase {
             Phase::Busy { frame, sender, error, end_ns, free_ns } if end_ns <= now_ns => {
                 self.phase = Phase::Free { from_ns: free_ns };
-                self.end_frame(&frame, sender, error, nodes);
+                self.end_frame(&frame, sender, error, now_ns, nodes);
                 join_and_leave(nodes);
             }
             Phase::Free { from_ns } if from_ns <= now_ns => {
@@ -137,12 +139,12 @@ impl SimBus {
         let bids = nodes.iter().enumerate().filter_map(|(index, node)| Some((Some(index), node.bid()?)));
         let simulated = self.traffic.peek(now_ns, bitrate_bps).filter(|(due_ns, _)| *due_ns <= now_ns);
         let simulated = simulated.map(|(_, frame)| (None, frame));
-        let Some((sender, frame)) = bids.chain(simulated).min_by_key(|(_, frame)| arbitration_field(frame))
+        let Some((sender, frame)) = bids.chain(simulated).min_by_key(|(_, frame)| arbitration_field(frame.id(), frame.is_remote()))
         else {
             return;
         };
         if sender.is_none() {
-            self.traffic.take();
+            self.traffic.take(now_ns);
         }
         for (index, node) in nodes.iter_mut().enumerate().filter(|(_, node)| node.bid().is_some()) {
             if Some(index) == sender { node.on_start() } else { node.on_lost() }
@@ -183,6 +185,11 @@ impl SimBus {
         }
         let in_step =
             |node: &&mut dyn Node| node.bitrate_bps().is_some_and(|own| same_rate(own, bitrate_bps));
+        let out_of_step = |node: &&mut dyn Node| node.bitrate_bps().is_some() && !in_step(node);
+        let mut others = nodes.iter().enumerate().filter(|(index, _)| Some(*index) != sender);
+        if others.any(|(_, node)| node.destroys() && out_of_step(node)) {
+            return Some(BusErrorKind::Stuff);
+        }
         let node_acknowledges = nodes
             .iter()
             .enumerate()
@@ -197,10 +204,14 @@ impl SimBus {
         frame: &Frame,
         sender: Option<usize>,
         error: Option<BusErrorKind>,
+        now_ns: u64,
         nodes: &mut [&mut dyn Node],
     ) {
-        if error.is_some() && sender.is_none() {
-            self.traffic.put_back(*frame);
+        match (sender, error) {
+            (None, Some(_)) => self.traffic.put_back(*frame, now_ns),
+            (None, None) => self.traffic.delivered(),
+            (Some(_), None) => self.traffic.hear(frame, now_ns),
+            (Some(_), Some(_)) => {}
         }
         let bitrate_bps = self.rate(nodes);
         for (index, node) in nodes.iter_mut().enumerate() {
@@ -232,10 +243,10 @@ fn same_rate(a: u32, b: u32) -> bool {
 }
 
 /// What arbitration compares, bit by bit; 0 wins.
-fn arbitration_field(frame: &Frame) -> u32 {
-    let remote = u32::from(frame.is_remote());
-    let raw = frame.id().raw();
-    if frame.id().is_extended() {
+pub(crate) fn arbitration_field(id: Id, remote: bool) -> u32 {
+    let remote = u32::from(remote);
+    let raw = id.raw();
+    if id.is_extended() {
         const SRR_AND_IDE: u32 = 0b11;
         (raw >> 18) << 21 | SRR_AND_IDE << 19 | (raw & 0x3_FFFF) << 1 | remote
     } else {
@@ -271,6 +282,9 @@ mod tests {
             self.bid
         }
         fn acknowledges(&self) -> bool {
+            self.acknowledges
+        }
+        fn destroys(&self) -> bool {
             self.acknowledges
         }
         fn on_start(&mut self) {}
@@ -369,6 +383,19 @@ mod tests {
         let mut node = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
         run(&mut bus, 100_000_000, &mut [&mut node]);
         assert!(node.seen.is_empty() && node.errors.len() > 50);
+    }
+
+    #[test]
+    fn who_takes_part_at_another_bit_rate_destroys_what_others_send() {
+        let mut bus = SimBus::new(Some(500_000), load(Frames::Std8, 50.0), 1);
+        let mut listener = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
+        let mut wrong = FakeNode { bitrate_bps: 250_000, ..FakeNode::new(None) };
+        run(&mut bus, 50_000_000, &mut [&mut listener, &mut wrong]);
+        let good = listener.seen.len();
+        assert!(good > 90 && listener.errors.is_empty(), "one that only listens disturbs nobody: {good}");
+        wrong.acknowledges = true;
+        run(&mut bus, 100_000_000, &mut [&mut listener, &mut wrong]);
+        assert!(listener.seen.len() <= good + 1 && listener.errors.len() > 50);
     }
 
     #[test]

@@ -7,6 +7,7 @@ mod bus;
 mod frames;
 mod traffic;
 
+pub(crate) use bus::arbitration_field;
 pub use bus::{Node, SimBus};
 pub use frames::{FrameSource, Frames, UnknownFrames};
-pub use traffic::{Schedule, Traffic};
+pub use traffic::{Schedule, Senders, Traffic};

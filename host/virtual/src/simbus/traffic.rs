@@ -1,14 +1,33 @@
 //! When simulated nodes send.
 
 use std::collections::VecDeque;
+use std::fmt::Debug;
 
 use cantap_wire::Frame;
 
 use super::frames::FrameSource;
 use cantap_trace::bits::FrameBits;
 
+/// Simulated nodes with a mind of their own: several want to send at once, and they hear what others send.
+///
+/// Times are the simulation's, in nanoseconds.
+pub trait Senders: Debug {
+    /// When one of them wants to send next.
+    fn due(&mut self, now_ns: u64) -> Option<u64>;
+    /// Of the frames that they want to send by now, the one with the lowest identifier.
+    fn bid(&mut self, now_ns: u64) -> Option<Frame>;
+    /// That frame is on the bus.
+    fn take(&mut self, now_ns: u64);
+    /// It has ended well.
+    fn delivered(&mut self);
+    /// It was destroyed.
+    fn destroyed(&mut self, frame: &Frame, now_ns: u64);
+    /// A frame of somebody else has ended well.
+    fn hear(&mut self, frame: &Frame, now_ns: u64);
+}
+
 /// When the next frame is due.
-#[derive(Clone, Debug)]
+#[derive(Debug)]
 pub enum Schedule {
     /// Nobody sends.
     Silent,
@@ -33,6 +52,8 @@ pub enum Schedule {
         /// Nanoseconds since the log's start, in order, with the frame.
         entries: std::vec::IntoIter<(u64, Frame)>,
     },
+    /// Nodes decide.
+    Nodes(Box<dyn Senders>),
 }
 
 /// The frames that simulated nodes want to send, one after the other.
@@ -65,8 +86,19 @@ impl Traffic {
         }
     }
 
+    /// When the next frame may start at the earliest, as [`Self::peek`] says it.
+    pub fn due(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<u64> {
+        match &mut self.schedule {
+            Schedule::Nodes(nodes) => nodes.due(now_ns),
+            _ => self.peek(now_ns, bitrate_bps).map(|(due_ns, _)| due_ns),
+        }
+    }
+
     /// The frame that is next, and when it may start at the earliest. `now_ns` is when the bus became free.
     pub fn peek(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
+        if let Schedule::Nodes(nodes) = &mut self.schedule {
+            return nodes.bid(now_ns).map(|frame| (now_ns, frame));
+        }
         if !self.started {
             self.started = true;
             self.start_ns = now_ns;
@@ -79,12 +111,32 @@ impl Traffic {
     }
 
     /// The frame is on the bus.
-    pub fn take(&mut self) {
+    pub fn take(&mut self, now_ns: u64) {
         self.next = None;
+        if let Schedule::Nodes(nodes) = &mut self.schedule {
+            nodes.take(now_ns);
+        }
+    }
+
+    /// The frame has ended well.
+    pub fn delivered(&mut self) {
+        if let Schedule::Nodes(nodes) = &mut self.schedule {
+            nodes.delivered();
+        }
+    }
+
+    /// Somebody else's frame has ended well.
+    pub fn hear(&mut self, frame: &Frame, now_ns: u64) {
+        if let Schedule::Nodes(nodes) = &mut self.schedule {
+            nodes.hear(frame, now_ns);
+        }
     }
 
     /// The frame was destroyed: it is sent again as soon as the bus is free.
-    pub fn put_back(&mut self, frame: Frame) {
+    pub fn put_back(&mut self, frame: Frame, now_ns: u64) {
+        if let Schedule::Nodes(nodes) = &mut self.schedule {
+            return nodes.destroyed(&frame, now_ns);
+        }
         if let Some((at_ns, next)) = self.next.replace((0, frame)) {
             self.waiting.push_front((at_ns, next));
         }
@@ -92,7 +144,8 @@ impl Traffic {
 
     fn plan(&mut self, now_ns: u64, bitrate_bps: u32) -> Option<(u64, Frame)> {
         match &mut self.schedule {
-            Schedule::Silent => None,
+            // Nodes are asked each time.
+            Schedule::Silent | Schedule::Nodes(_) => None,
             Schedule::Load { source, percent } => {
                 let frame = source.next()?;
                 if *percent >= 100.0 {

@@ -6,10 +6,14 @@ use std::ops::Deref;
 use std::str::FromStr;
 
 use anyhow::Context;
-use cantap::Device;
+use cantap::wire::CHANNELS;
+use cantap::{Channel, Device};
 #[cfg(feature = "emu")]
 use cantap::device::Link;
 use cantap_virtual::Options;
+
+/// The virtual device's buses have the bit rate of whoever opens a channel: this one, if nobody says another.
+const VIRTUAL_BITRATE_BPS: u32 = 500_000;
 
 /// The address of a device, as users type it after `-d`.
 #[derive(Clone, Debug)]
@@ -102,6 +106,11 @@ impl Address {
         !matches!(&self.place, Place::Virtual(options) if options.settings.is_none())
     }
 
+    /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
+    pub fn is_car(&self) -> bool {
+        matches!(&self.place, Place::Virtual(options) if options.car)
+    }
+
     /// Whether a device there can go and come back: one that lives in this process cannot.
     pub const fn may_come_back(&self) -> bool {
         matches!(self.place, Place::Serial)
@@ -111,7 +120,7 @@ impl Address {
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> anyhow::Result<OpenDevice> {
         match serial_number.filter(|_| self.may_come_back()).and_then(cantap::device::port_of) {
-            Some(port) => Ok(OpenDevice { device: Device::open(&port)?, takes_any_bit_rate: false }),
+            Some(port) => Ok(OpenDevice { device: Device::open(&port)?, bitrates: [None; CHANNELS] }),
             None => self.open(),
         }
     }
@@ -134,7 +143,12 @@ impl Address {
                 Device::over(Link::new(port.reader, port.writer).keeping(port.device), &self.text)?
             }
         };
-        Ok(OpenDevice { device, takes_any_bit_rate: matches!(self.place, Place::Virtual(_)) })
+        let bitrates = match &self.place {
+            Place::Virtual(options) => Channel::ALL
+                .map(|channel| options.bitrate_of_bus(channel.index()).or(Some(VIRTUAL_BITRATE_BPS))),
+            _ => [None; CHANNELS],
+        };
+        Ok(OpenDevice { device, bitrates })
     }
 }
 
@@ -153,13 +167,14 @@ impl fmt::Display for Address {
 /// A device in a session, and what only its address tells about it.
 pub struct OpenDevice {
     device: Device,
-    takes_any_bit_rate: bool,
+    /// Its buses' bit rates in bit/s, where they are known.
+    bitrates: [Option<u32>; CHANNELS],
 }
 
 impl OpenDevice {
-    /// Whether its buses have the bit rate of whoever opens a channel.
-    pub const fn takes_any_bit_rate(&self) -> bool {
-        self.takes_any_bit_rate
+    /// The bit rate of a channel's bus in bit/s, if it is known without listening.
+    pub const fn bitrate_of_bus(&self, channel: Channel) -> Option<u32> {
+        self.bitrates[channel.index()]
     }
 }
 

@@ -14,9 +14,6 @@ use crate::args;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
 
-/// Bit rate of a virtual bus where none was given: its simulated nodes take any.
-const VIRTUAL_BITRATE_BPS: u32 = 500_000;
-
 /// How to open a channel; for commands to flatten into theirs.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct ChannelArgs {
@@ -205,12 +202,10 @@ impl ChannelArgs {
             Some(request) => {
                 (ChannelConfig::listen_only(request.resolve(device.hello().can_clock_hz)?), None)
             }
-            None => match device.defaults(channel)? {
-                Some(saved) => (saved.config, Some(saved)),
-                None if device.takes_any_bit_rate() => {
-                    (ChannelConfig::listen_only(device.timing(VIRTUAL_BITRATE_BPS)?), None)
-                }
-                None => bail!(
+            None => match (device.defaults(channel)?, device.bitrate_of_bus(channel)) {
+                (Some(saved), _) => (saved.config, Some(saved)),
+                (None, Some(bitrate_bps)) => (ChannelConfig::listen_only(device.timing(bitrate_bps)?), None),
+                (None, None) => bail!(
                     "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
                      with `cantap defaults save`",
                     channel.number()

@@ -4,10 +4,12 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
-use cantap_signals::{Database, Decoder, Override, Selection, Source};
+use cantap_signals::{Database, DatabaseError, Decoder, Override, Selection, Source};
+
+use crate::address::Address;
 
 /// Which databases; for commands to flatten into theirs.
-#[derive(clap::Args)]
+#[derive(Clone, clap::Args)]
 pub struct DatabaseArgs {
     /// A database: a DBC file or a .toml signal file; with a channel before it (2:FILE) it is that
     /// channel's only one, without it serves all others. Can be repeated.
@@ -16,7 +18,13 @@ pub struct DatabaseArgs {
     /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.
     #[arg(long)]
     j1939: bool,
+    /// The virtual vehicle's own database.
+    #[arg(skip)]
+    car: bool,
 }
+
+/// Said where the vehicle's own database is used.
+pub const CAR: &str = "signals are shown by the vehicle's own database; `cantap virtual car --dbc` prints it";
 
 /// A database file and its channel.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -44,14 +52,35 @@ impl FromStr for DatabasePath {
 }
 
 impl DatabaseArgs {
-    /// Whether any was given.
+    /// These, or, if there are none and a virtual vehicle is listened to, the vehicle's own, for all channels.
+    #[must_use]
+    pub fn or_of<'a>(&self, devices: impl IntoIterator<Item = &'a Address>) -> Self {
+        let car = self.databases.is_empty() && devices.into_iter().any(Address::is_car);
+        Self { car, ..self.clone() }
+    }
+
+    /// Whether there are none.
     pub fn is_empty(&self) -> bool {
-        self.databases.is_empty()
+        self.databases.is_empty() && !self.car
+    }
+
+    /// Whether it is the virtual vehicle's own.
+    pub const fn is_of_car(&self) -> bool {
+        self.car
+    }
+
+    /// The virtual vehicle's own, if it is to be used.
+    fn own(&self) -> Result<Option<Source>, DatabaseError> {
+        let database = self.car.then(cantap_virtual::car::database).transpose()?;
+        Ok(database.map(|database| Source { channel: None, database }))
     }
 
     /// Loads the databases. Warnings go to standard error, unless `quiet`; with `strict` they are errors.
     pub fn load(&self, strict: bool, quiet: bool) -> anyhow::Result<Decoder> {
-        let mut sources = Vec::new();
+        let mut sources: Vec<_> = self.own()?.into_iter().collect();
+        if self.car && !quiet {
+            eprintln!("cantap: {CAR}");
+        }
         for DatabasePath { channel, path } in &self.databases {
             let database = cantap_signals::load(path)?;
             if !quiet || strict {
@@ -87,7 +116,7 @@ impl DatabaseArgs {
                 Err(reason) => complaints.push(format!("database {text}: {reason}")),
             }
         }
-        let mut sources = Vec::new();
+        let mut sources: Vec<_> = self.own().ok().flatten().into_iter().collect();
         for DatabasePath { channel, path } in paths {
             match cantap_signals::load(&path) {
                 Ok(database) => {

@@ -53,6 +53,11 @@ pub struct LiveRecords {
 }
 
 impl LiveArgs {
+    /// The devices that were given.
+    pub fn devices(&self) -> impl Iterator<Item = &Address> {
+        self.device.iter()
+    }
+
     /// Opens the device and its channels, if one was given.
     pub fn open(&self) -> anyhow::Result<Option<LiveRecords>> {
         let Some(address) = &self.device else { return Ok(None) };

@@ -6,6 +6,7 @@ use anyhow::Context;
 use cantap_signals::condition::Condition;
 use cantap_signals::trigger::{Trigger, Window};
 
+use crate::address::Address;
 use crate::args;
 use crate::databases::DatabaseArgs;
 
@@ -30,10 +31,13 @@ pub struct TriggerArgs {
 }
 
 impl TriggerArgs {
-    /// The trigger, if one was asked for.
-    pub fn trigger(&self) -> anyhow::Result<Option<Trigger>> {
+    /// The trigger, if one was asked for, for what these devices hear.
+    pub fn trigger<'a>(
+        &self,
+        devices: impl IntoIterator<Item = &'a Address>,
+    ) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
-        let decoder = self.databases.load(false, false)?;
+        let decoder = self.databases.or_of(devices).load(false, false)?;
         let condition = Condition::new(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =

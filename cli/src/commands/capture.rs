@@ -132,7 +132,7 @@ fn needs_bit_rate(args: &Args) -> anyhow::Result<bool> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A virtual device without settings has no bit rate saved.
-    if !args.device.may_have_saved() && needs_bit_rate(args)? {
+    if !args.device.may_have_saved() && !args.device.is_car() && needs_bit_rate(args)? {
         let message = "give the bus's bit rate with -b, such as -b 500k, for each channel that -c names\n";
         clap::Error::raw(clap::error::ErrorKind::MissingRequiredArgument, message).exit();
     }
@@ -329,7 +329,7 @@ impl Sink {
             writer: None,
             name: String::new(),
             to_stdout: false,
-            trigger: args.trigger.trigger()?,
+            trigger: args.trigger.trigger([&args.device])?,
             omits_data: [false; CHANNELS],
             without_data: 0,
         };

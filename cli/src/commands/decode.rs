@@ -81,10 +81,11 @@ struct Count {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    if args.databases.is_empty() {
+    let databases = args.databases.or_of(args.live.devices());
+    if databases.is_empty() {
         anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
     }
-    let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
+    let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
     let count = decode(args, &decoder, &mut out)?;
     out.flush()?;

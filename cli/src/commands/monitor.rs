@@ -15,7 +15,7 @@ use crate::address::Address;
 use crate::args;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::databases::DatabaseArgs;
+use crate::databases::{self, DatabaseArgs};
 use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
 use crate::monitor::profile::Profile;
@@ -153,7 +153,11 @@ fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {
 
 fn load_databases(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Decoder {
     let own = if args.databases.is_empty() { profile.databases.as_slice() } else { &[] };
-    args.databases.load_what_can_be(own, complaints)
+    let databases = if own.is_empty() { args.databases.or_of(&args.device) } else { args.databases.clone() };
+    if databases.is_of_car() {
+        complaints.push(databases::CAR.to_owned());
+    }
+    databases.load_what_can_be(own, complaints)
 }
 
 /// How channels are opened: what the command line leaves open, the profile says.

@@ -84,7 +84,8 @@ const MAX_CONTEXT: usize = 1_000_000;
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let decoder = args.databases.load(args.read.strict, args.quiet)?;
+    let databases = args.databases.or_of(args.live.devices());
+    let decoder = databases.load(args.read.strict, args.quiet)?;
     let text = args.condition.as_ref().or(args.positional.as_ref());
     let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
     let condition = condition.context("condition")?;

@@ -118,10 +118,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 
 impl Args {
     fn frames(&self) -> anyhow::Result<Vec<Frame>> {
-        let database = self.databases.load(false, self.quiet)?;
+        // A colon stands in no frame and in every message with values.
+        let is_message = |text: &String| text.contains(':') && !text.contains('#');
+        let device = self.frames.iter().any(is_message).then_some(&self.device);
+        let database = self.databases.or_of(device).load(false, self.quiet)?;
         let frame = |text: &String| {
-            // A colon stands in no frame and in every message with values.
-            if text.contains(':') && !text.contains('#') {
+            if is_message(text) {
                 Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = text.parse::<Frame>();

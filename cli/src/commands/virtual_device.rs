@@ -4,13 +4,15 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cantap_virtual::{Options, open_terminal};
+use cantap_virtual::{Options, car, open_terminal};
 
 use crate::interrupt;
 
 /// The command line.
 #[derive(clap::Args)]
-#[command(after_help = "Options, separated by commas:\n  load=PCT         bus load, 0 to 100 (50)\n  \
+#[command(after_help = "Options, separated by commas:\n  \
+                        car              a vehicle: 500k on channel 1, 125k on channel 2, its database is printed by --dbc;\n                   \
+                        it goes with errors, disturb, ack, channels, seed, settings, pace, ppm and serial\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
                         bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
@@ -26,15 +28,23 @@ use crate::interrupt;
                         serial=NAME      the serial number that it tells (VIRTUAL)\n  \
                         log=FILE         replay a trace file at its own times; must come last\n\n\
                         The same options follow `virtual:` wherever a device is asked for.\n\n\
-                        Examples:\n  cantap virtual load=100,frames=std0\n  cantap virtual bitrate=250k,log=drive.log")]
+                        Examples:\n  cantap virtual load=100,frames=std0\n  cantap virtual bitrate=250k,log=drive.log\n  \
+                        cantap virtual car\n  cantap virtual car --dbc > car.dbc")]
 pub struct Args {
     /// What happens on the simulated buses.
     #[arg(default_value = "")]
     options: Options,
+    /// Print the database of the vehicle (a DBC file) and leave.
+    #[arg(long)]
+    dbc: bool,
 }
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if args.dbc {
+        std::io::stdout().lock().write_all(car::DATABASE.as_bytes())?;
+        return Ok(ExitCode::SUCCESS);
+    }
     interrupt::watch()?;
     let terminal = open_terminal(args.options.clone())?;
     let mut out = std::io::stdout().lock();

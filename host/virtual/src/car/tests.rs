@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 
 use cantap_firmware::bus::checksum::checksum;
 use cantap_signals::{Decoder, SignalValue, Source};
+use cantap_trace::TraceFrame;
 use cantap_trace::bits::FrameBits;
 use cantap_wire::message::Checksum;
 use cantap_wire::record::BusErrorKind;
@@ -112,7 +113,7 @@ fn signals(frames: &[(u64, Frame)]) -> BTreeMap<String, Vec<(f64, f64)>> {
     let mut signals: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
     let mut values: Vec<SignalValue> = Vec::new();
     for (at_ns, frame) in frames {
-        let message = decoder.decode(1, frame, &mut values).unwrap_or_else(|| panic!("{frame} is in no message"));
+        let message = decoder.decode(1, &TraceFrame::from(*frame), &mut values).unwrap_or_else(|| panic!("{frame} is in no message"));
         for value in &values {
             let signal = &decoder.message(message).signals[value.signal as usize];
             let physical = value.value;
@@ -183,7 +184,7 @@ fn counters_and_checksums_hold() {
     let mut checked: BTreeMap<&str, u32> = BTreeMap::new();
     for (_, frame) in train.iter().chain(&body) {
         let mut values = Vec::new();
-        let message = decoder.message(decoder.decode(1, frame, &mut values).unwrap());
+        let message = decoder.message(decoder.decode(1, &TraceFrame::from(*frame), &mut values).unwrap());
         for value in values {
             let signal = &message.signals[value.signal as usize];
             let now = value.value;

@@ -154,7 +154,7 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "KeyButton" => f64::from(car.key()),
         "KeyBattery" => 88.0,
         "AbsActive" | "EspActive" | "CrashDetected" | "DoorRL" | "DoorRR" | "Trunk" | "Hood" | "Hazard"
-        | "ReverseLight" | "RearFog" | "WindowFR" | "WindowRL" | "WindowRR" | "Sunroof" => 0.0,
+        | "ReverseLight" | "RearFog" | "J1939SpnHigh" | "J1939ConversionMethod" | "WindowFR" | "WindowRL" | "WindowRR" | "Sunroof" => 0.0,
         _ if signal.starts_with("TyreTemperature") => car.tyres,
         _ if signal.starts_with("J1939TpByte") => f64::from(vin_byte(signal, context.part)),
         _ if signal.ends_with("Counter") => f64::from(context.sent % 16),

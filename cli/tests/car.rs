@@ -1,0 +1,61 @@
+//! `virtual:car` through the command: its database goes with it, and another program reads what it sends by that database.
+//!
+//! cantools is in `CANTAP_PYTHON`, else `python3`. Where it is missing that is said and the test passes, unless
+//! `CANTAP_REQUIRE_PEERS=1`.
+
+use std::process::{Command, Output};
+
+fn cantap(arguments: &[&str]) -> (String, String) {
+    let Output { status, stdout, stderr } =
+        Command::new(env!("CARGO_BIN_EXE_cantap")).args(arguments).output().unwrap();
+    let (out, err) = (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap());
+    assert!(status.success(), "{arguments:?}: {err}");
+    (out, err)
+}
+
+#[test]
+fn cantools_reads_the_database_and_finds_every_frame_in_range() {
+    let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let there = Command::new(&python).args(["-c", "import cantools"]).output();
+    if !there.is_ok_and(|output| output.status.success()) {
+        let required = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
+        assert!(!required, "cantools is required and does not run");
+        eprintln!("SKIPPED: cantools is not installed, so the car's database was not read by it");
+        return;
+    }
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    std::fs::write(path("car.dbc"), cantap(&["virtual", "car", "--dbc"]).0).unwrap();
+    // Both buses at their own rates, for a minute of the car's time.
+    let device = "virtual:car,pace=fast";
+    cantap(&["capture", "-d", device, "-n", "50000", "-o", &path("car.log")]);
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/car_peer.py");
+    let output =
+        Command::new(python).args([script, &path("car.dbc"), &path("car.log")]).output().unwrap();
+    let said = String::from_utf8(output.stdout).unwrap();
+    assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
+    let words: Vec<&str> = said.split_whitespace().collect();
+    let [frames, messages] = words[..] else { panic!("{said}") };
+    assert!(frames.parse::<u32>().unwrap() >= 50_000, "{said}");
+    // All but those of testers and of a key's buttons.
+    assert!(messages.parse::<u32>().unwrap() >= 34, "{said}");
+}
+
+#[test]
+fn the_live_view_shows_signals_by_itself_and_says_whose_they_are() {
+    let (screen, said) = cantap(&[
+        "monitor", "-d", "virtual:car", "--view", "signals", "--once", "-t", "1s", "--size", "120x50",
+    ]);
+    assert!(screen.contains("EngineSpeed") && screen.contains("rpm"), "{screen}");
+    assert!(said.contains("cantap virtual car --dbc"), "{said}");
+}
+
+#[test]
+fn messages_are_sent_by_the_car_s_own_names() {
+    let send = |frame: &str| cantap(&["send", "-d", "virtual:car", "1", frame]);
+    let (sent, said) = send("SWM_Buttons:Button=Phone,ButtonPressed=1");
+    assert!(sent.contains("5A0#14"), "{sent}");
+    assert!(said.contains("cantap virtual car --dbc"), "{said}");
+    let (sent, said) = send("7DF#02010C");
+    assert!(sent.contains("7DF#02010C") && !said.contains("--dbc"), "{sent}{said}");
+}

@@ -6,10 +6,10 @@ use std::ops::Deref;
 use std::str::FromStr;
 
 use anyhow::Context;
-use cantap::wire::CHANNELS;
-use cantap::{Channel, Device};
 #[cfg(feature = "emu")]
 use cantap::device::Link;
+use cantap::wire::CHANNELS;
+use cantap::{Channel, Device};
 use cantap_virtual::Options;
 
 /// The virtual device's buses have the bit rate of whoever opens a channel: this one, if nobody says another.

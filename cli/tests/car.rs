@@ -30,8 +30,7 @@ fn cantools_reads_the_database_and_finds_every_frame_in_range() {
     let device = "virtual:car,pace=fast";
     cantap(&["capture", "-d", device, "-n", "50000", "-o", &path("car.log")]);
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/car_peer.py");
-    let output =
-        Command::new(python).args([script, &path("car.dbc"), &path("car.log")]).output().unwrap();
+    let output = Command::new(python).args([script, &path("car.dbc"), &path("car.log")]).output().unwrap();
     let said = String::from_utf8(output.stdout).unwrap();
     assert!(output.status.success(), "{said}{}", String::from_utf8_lossy(&output.stderr));
     let words: Vec<&str> = said.split_whitespace().collect();
@@ -44,7 +43,16 @@ fn cantools_reads_the_database_and_finds_every_frame_in_range() {
 #[test]
 fn the_live_view_shows_signals_by_itself_and_says_whose_they_are() {
     let (screen, said) = cantap(&[
-        "monitor", "-d", "virtual:car", "--view", "signals", "--once", "-t", "1s", "--size", "120x50",
+        "monitor",
+        "-d",
+        "virtual:car",
+        "--view",
+        "signals",
+        "--once",
+        "-t",
+        "1s",
+        "--size",
+        "120x50",
     ]);
     assert!(screen.contains("EngineSpeed") && screen.contains("rpm"), "{screen}");
     assert!(said.contains("cantap virtual car --dbc"), "{said}");

@@ -130,8 +130,15 @@ impl CarBus {
     pub fn new(bus: usize, seed: u64) -> Self {
         // Cannot fail: a test reads it.
         let database = database().unwrap_or_default();
-        let mut made =
-            Self { car: Vehicle::new(seed), seed, ecus: vec![], entries: vec![], tested: vec![], again: VecDeque::new(), sending: 0 };
+        let mut made = Self {
+            car: Vehicle::new(seed),
+            seed,
+            ecus: vec![],
+            entries: vec![],
+            tested: vec![],
+            again: VecDeque::new(),
+            sending: 0,
+        };
         for message in &database.messages {
             let sender = message.name.split('_').next().unwrap_or_default();
             if sender == "DIAG" || BODY.contains(&sender) != (bus == 1) {

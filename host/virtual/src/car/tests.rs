@@ -113,7 +113,9 @@ fn signals(frames: &[(u64, Frame)]) -> BTreeMap<String, Vec<(f64, f64)>> {
     let mut signals: BTreeMap<String, Vec<(f64, f64)>> = BTreeMap::new();
     let mut values: Vec<SignalValue> = Vec::new();
     for (at_ns, frame) in frames {
-        let message = decoder.decode(1, &TraceFrame::from(*frame), &mut values).unwrap_or_else(|| panic!("{frame} is in no message"));
+        let message = decoder
+            .decode(1, &TraceFrame::from(*frame), &mut values)
+            .unwrap_or_else(|| panic!("{frame} is in no message"));
         for value in &values {
             let signal = &decoder.message(message).signals[value.signal as usize];
             let physical = value.value;
@@ -150,14 +152,20 @@ fn messages_come_in_their_cycles_with_a_little_jitter() {
             times.entry(frame.id().raw()).or_default().push(*at_ns);
         }
         signals(&frames);
-        for (_, _, message) in decoder.messages().filter(|(_, _, message)| !message.name.starts_with("DIAG_")) {
+        for (_, _, message) in decoder.messages().filter(|(_, _, message)| !message.name.starts_with("DIAG_"))
+        {
             let sender = message.name.split('_').next().unwrap();
             if BODY.contains(&sender) != (bus == 1) || message.name == "BBM_TPDT" {
                 continue;
             }
             let times = times.get(&message.id.raw()).map_or(&[][..], Vec::as_slice);
             let Some(cycle_ms) = message.cycle_ms.filter(|ms| *ms > 0) else {
-                assert!(message.name == "BCM_Key" || times.len() >= 10, "{} came {}", message.name, times.len());
+                assert!(
+                    message.name == "BCM_Key" || times.len() >= 10,
+                    "{} came {}",
+                    message.name,
+                    times.len()
+                );
                 continue;
             };
             let cycle_ns = u64::from(cycle_ms) * MS_NS;
@@ -312,7 +320,11 @@ fn a_disturbed_car_suffers_and_recovers() {
     let from_ns = rig.analyser.now_ns;
     rig.run(8 * SECOND_NS);
     let after = rig.with_id(0x0C0, from_ns);
-    assert!((150..=200).contains(&after.len()), "{} of 200: some were left out while it was away", after.len());
+    assert!(
+        (150..=200).contains(&after.len()),
+        "{} of 200: some were left out while it was away",
+        after.len()
+    );
     let counters: Vec<u8> = after.iter().map(|data| data[6] & 15).collect();
     assert!(counters.windows(2).all(|pair| (pair[0] + 1) % 16 == pair[1]), "{counters:?}");
 }

@@ -73,7 +73,13 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "FuelConsumption" => 0.0,
         "Range" => car.fuel / 0.068,
         "CylinderPage" => f64::from(context.part),
-        "SelectorLever" => if car.in_drive() { 3.0 } else { 0.0 },
+        "SelectorLever" => {
+            if car.in_drive() {
+                3.0
+            } else {
+                0.0
+            }
+        }
         "ShiftActive" => flag(car.shifts()),
         "CurrentGear" | "GwGear" | "DisplayedGear" => f64::from(car.gear),
         "TargetGear" => f64::from(car.target_gear),
@@ -85,7 +91,13 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "WheelSpeedRR" => car.wheel(3),
         "VehicleSpeed" | "GwVehicleSpeed" | "J1939WheelSpeed" => kmh,
         // As the law wants it: never less than it is.
-        "DisplayedSpeed" => if moving { kmh * 1.02 + 1.0 } else { 0.0 },
+        "DisplayedSpeed" => {
+            if moving {
+                kmh * 1.02 + 1.0
+            } else {
+                0.0
+            }
+        }
         "BrakePressure" => car.brake_pressure,
         "BrakePedal" | "BrakeLight" | "J1939BrakeSwitch" => flag(car.brake_pedal()),
         "ParkingBrake" | "GwParkingBrake" | "J1939ParkingBrake" => flag(car.parking_brake()),
@@ -107,14 +119,32 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "J1939TotalDistance" => car.odometer / 1000.0,
         "Button" => f64::from(car.button()),
         "ButtonPressed" => flag(car.button() != 0),
-        "J1939TorqueMode" => if car.pedal > 1.0 { 1.0 } else { 0.0 },
+        "J1939TorqueMode" => {
+            if car.pedal > 1.0 {
+                1.0
+            } else {
+                0.0
+            }
+        }
         "J1939DriverDemandTorque" => car.pedal,
         "J1939ActualTorque" => car.torque_percent(),
         "J1939FuelEconomy" => (kmh / car.fuel_rate.max(0.5)).min(125.0),
         "J1939SourceAddress" => 0.0,
         "J1939Barometer" => 101.0,
-        "J1939Spn" => if context.faulty { J1939_FAULT.0 } else { 0.0 },
-        "J1939Fmi" => if context.faulty { J1939_FAULT.1 } else { 0.0 },
+        "J1939Spn" => {
+            if context.faulty {
+                J1939_FAULT.0
+            } else {
+                0.0
+            }
+        }
+        "J1939Fmi" => {
+            if context.faulty {
+                J1939_FAULT.1
+            } else {
+                0.0
+            }
+        }
         "J1939Occurrences" => flag(context.faulty),
         // BAM, the broadcast of SAE J1939-21.
         "J1939TpControl" => 32.0,
@@ -129,18 +159,48 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "HighBeam" => flag(car.high_beam()),
         "TurnLeft" => flag(car.left_lamps()),
         "TurnRight" => flag(car.right_lamps()),
-        "DashBrightness" => if car.low_beam() { 60.0 } else { 100.0 },
+        "DashBrightness" => {
+            if car.low_beam() {
+                60.0
+            } else {
+                100.0
+            }
+        }
         "WindowFL" => car.window,
-        "WiperMode" => if car.wipes_fast() { 3.0 } else { 2.0 * flag(car.wipes()) },
+        "WiperMode" => {
+            if car.wipes_fast() {
+                3.0
+            } else {
+                2.0 * flag(car.wipes())
+            }
+        }
         "WiperAngle" => car.wiper,
-        "RainIntensity" => if car.wipes_fast() { 70.0 } else { 30.0 * flag(car.wipes()) },
+        "RainIntensity" => {
+            if car.wipes_fast() {
+                70.0
+            } else {
+                30.0 * flag(car.wipes())
+            }
+        }
         "WasherLevel" => 80.0,
-        "Ignition" => if car.cranks() { 3.0 } else { 2.0 },
+        "Ignition" => {
+            if car.cranks() {
+                3.0
+            } else {
+                2.0
+            }
+        }
         "BatteryCurrent" if car.cranks() => -140.0,
         "BatteryCurrent" => (car.battery - 12.8) * 9.0,
         "CabinTemperature" => car.cabin,
         "SetTemperature" => 21.5,
-        "FanSpeed" => if car.coolant > 50.0 { 5.0 } else { 2.0 },
+        "FanSpeed" => {
+            if car.coolant > 50.0 {
+                5.0
+            } else {
+                2.0
+            }
+        }
         "Compressor" => flag(car.cabin > 23.0),
         "EvaporatorTemperature" => car.cabin - 6.0,
         "TyrePressureFL" | "TyrePressureFR" => 230.0 + (car.tyres - 20.0) * 0.8,
@@ -153,8 +213,22 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "Year" => date(car).2,
         "KeyButton" => f64::from(car.key()),
         "KeyBattery" => 88.0,
-        "AbsActive" | "EspActive" | "CrashDetected" | "DoorRL" | "DoorRR" | "Trunk" | "Hood" | "Hazard"
-        | "ReverseLight" | "RearFog" | "J1939SpnHigh" | "J1939ConversionMethod" | "WindowFR" | "WindowRL" | "WindowRR" | "Sunroof" => 0.0,
+        "AbsActive"
+        | "EspActive"
+        | "CrashDetected"
+        | "DoorRL"
+        | "DoorRR"
+        | "Trunk"
+        | "Hood"
+        | "Hazard"
+        | "ReverseLight"
+        | "RearFog"
+        | "J1939SpnHigh"
+        | "J1939ConversionMethod"
+        | "WindowFR"
+        | "WindowRL"
+        | "WindowRR"
+        | "Sunroof" => 0.0,
         _ if signal.starts_with("TyreTemperature") => car.tyres,
         _ if signal.starts_with("J1939TpByte") => f64::from(vin_byte(signal, context.part)),
         _ if signal.ends_with("Counter") => f64::from(context.sent % 16),

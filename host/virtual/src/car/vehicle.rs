@@ -125,7 +125,8 @@ fn approach(value: &mut f64, target: f64, per_second: f64) {
 impl Vehicle {
     /// The ignition is switched on, the engine is cold.
     pub fn new(seed: u64) -> Self {
-        let character = (seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as f64 / f64::from(1_u32 << 24) - 0.5;
+        let character =
+            (seed.wrapping_mul(0x9E37_79B9_7F4A_7C15) >> 40) as f64 / f64::from(1_u32 << 24) - 0.5;
         let ambient = AMBIENT_C + 4.0 * character;
         Self {
             steps: 0,

@@ -1,7 +1,7 @@
 //! The bus: one frame at a time, the lowest identifier first.
 
-use cantap_wire::{Frame, Id};
 use cantap_wire::record::BusErrorKind;
+use cantap_wire::{Frame, Id};
 
 use super::Traffic;
 use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
@@ -139,7 +139,8 @@ impl SimBus {
         let bids = nodes.iter().enumerate().filter_map(|(index, node)| Some((Some(index), node.bid()?)));
         let simulated = self.traffic.peek(now_ns, bitrate_bps).filter(|(due_ns, _)| *due_ns <= now_ns);
         let simulated = simulated.map(|(_, frame)| (None, frame));
-        let Some((sender, frame)) = bids.chain(simulated).min_by_key(|(_, frame)| arbitration_field(frame.id(), frame.is_remote()))
+        let Some((sender, frame)) =
+            bids.chain(simulated).min_by_key(|(_, frame)| arbitration_field(frame.id(), frame.is_remote()))
         else {
             return;
         };

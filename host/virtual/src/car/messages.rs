@@ -39,7 +39,7 @@ impl Layout {
     }
 
     /// The message's data for the car as it is.
-    pub fn data(&self, car: &Vehicle, context: &Context) -> Vec<u8> {
+    pub fn data(&self, car: &Vehicle, context: Context) -> Vec<u8> {
         let inputs: Vec<_> = (self.message.signals.iter().enumerate())
             .filter(|(at, signal)| {
                 let multiplexed = signal.multiplexed.as_ref();
@@ -67,7 +67,7 @@ impl Layout {
     }
 
     /// The same as a frame.
-    pub fn frame(&self, car: &Vehicle, context: &Context) -> Frame {
+    pub fn frame(&self, car: &Vehicle, context: Context) -> Frame {
         let data = self.data(car, context);
         let mut padded = [0; 8];
         padded[..data.len()].copy_from_slice(&data);

@@ -199,7 +199,7 @@ impl CarBus {
             if self.entries[at].on_change {
                 // Without the counter.
                 let context = Context { sent: 0, ..self.context(&self.entries[at]) };
-                let shows = self.entries[at].layout.data(&self.car, &context);
+                let shows = self.entries[at].layout.data(&self.car, context);
                 if shows != self.entries[at].shown {
                     self.entries[at].shown = shows;
                     changed.push(at);
@@ -245,7 +245,7 @@ impl CarBus {
             Origin::Again => self.again.front().map(|(_, frame)| *frame),
             Origin::Entry(at) => {
                 let entry = &self.entries[at];
-                Some(entry.layout.frame(&self.car, &self.context(entry)))
+                Some(entry.layout.frame(&self.car, self.context(entry)))
             }
             Origin::Tested(at) => self.tested[at].connection.peek(),
         }

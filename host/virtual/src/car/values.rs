@@ -43,7 +43,7 @@ const MONTHS: [(u64, u64, u64); 12] = [
 ];
 
 /// A signal's physical value; `None` if there is no such signal. Counters count what was sent; checksums come later.
-pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
+pub fn value(signal: &str, car: &Vehicle, context: Context) -> Option<f64> {
     let flag = |on: bool| f64::from(u8::from(on));
     let kmh = car.speed * 3.6;
     let (load, ignition) = (car.load(), car.ignition());
@@ -56,7 +56,7 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "ThrottlePosition" | "J1939Throttle" => car.throttle,
         "EngineState" if car.runs() => 2.0,
         "EngineState" => flag(car.cranks()),
-        "AcceleratorPedal" | "J1939AcceleratorPedal" => car.pedal,
+        "AcceleratorPedal" | "J1939AcceleratorPedal" | "J1939DriverDemandTorque" => car.pedal,
         "EngineLoad" | "J1939EngineLoad" => load,
         "ManifoldPressure" => car.manifold(),
         "FuelRate" | "J1939FuelRate" => car.fuel_rate,
@@ -69,8 +69,13 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "OilPressure" | "J1939OilPressure" => oil_pressure,
         "BatteryVoltage" | "BodyVoltage" => car.battery,
         "FuelLevel" => car.fuel,
-        "FuelConsumption" if kmh > 5.0 => car.fuel_rate / kmh * 100.0,
-        "FuelConsumption" => 0.0,
+        "FuelConsumption" => {
+            if kmh > 5.0 {
+                car.fuel_rate / kmh * 100.0
+            } else {
+                0.0
+            }
+        }
         "Range" => car.fuel / 0.068,
         "CylinderPage" => f64::from(context.part),
         "SelectorLever" => {
@@ -110,13 +115,12 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         "BeltPassenger" => flag(car.passenger_belt()),
         "PassengerPresent" => flag(car.passenger()),
         "AirbagState" => 1.0,
-        "MalfunctionLamp" | "J1939MalfunctionLamp" => flag(context.faulty),
+        "MalfunctionLamp" | "J1939MalfunctionLamp" | "J1939Occurrences" => flag(context.faulty),
         "OilLamp" => flag(oil_pressure < 60.0),
         "BeltLamp" => flag(!car.belt() || car.passenger() && !car.passenger_belt()),
         "FuelLamp" => flag(car.fuel < 8.0),
-        "Odometer" => car.odometer / 1000.0,
+        "Odometer" | "J1939TotalDistance" => car.odometer / 1000.0,
         "TripDistance" | "J1939TripDistance" => car.trip / 1000.0,
-        "J1939TotalDistance" => car.odometer / 1000.0,
         "Button" => f64::from(car.button()),
         "ButtonPressed" => flag(car.button() != 0),
         "J1939TorqueMode" => {
@@ -126,10 +130,8 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
                 0.0
             }
         }
-        "J1939DriverDemandTorque" => car.pedal,
         "J1939ActualTorque" => car.torque_percent(),
         "J1939FuelEconomy" => (kmh / car.fuel_rate.max(0.5)).min(125.0),
-        "J1939SourceAddress" => 0.0,
         "J1939Barometer" => 101.0,
         "J1939Spn" => {
             if context.faulty {
@@ -145,7 +147,6 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
                 0.0
             }
         }
-        "J1939Occurrences" => flag(context.faulty),
         // BAM, the broadcast of SAE J1939-21.
         "J1939TpControl" => 32.0,
         "J1939TpBytes" => J1939_VIN_BYTES as f64,
@@ -224,6 +225,7 @@ pub fn value(signal: &str, car: &Vehicle, context: &Context) -> Option<f64> {
         | "ReverseLight"
         | "RearFog"
         | "J1939SpnHigh"
+        | "J1939SourceAddress"
         | "J1939ConversionMethod"
         | "WindowFR"
         | "WindowRL"

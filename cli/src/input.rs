@@ -4,7 +4,7 @@ use std::path::Path;
 
 use anyhow::bail;
 use cantap::TraceRecord;
-use cantap_formats::{Format, LeftOut, ReadOptions, TraceReader, open_reader};
+use cantap_formats::{Format, LeftOut, ReadOptions, TraceReader, Zone, open_reader};
 use cantap_trace::filter::Filter;
 
 use crate::interrupt;
@@ -25,6 +25,9 @@ pub struct ReadArgs {
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Repeat for any of several.
     #[arg(short, long, value_name = "FILTER")]
     pub filter: Vec<Filter>,
+    /// The time zone of dates in files that name none, such as ASC, TRC and BLF: Europe/Berlin, +02:00.
+    #[arg(long, value_name = "ZONE", default_value_t)]
+    pub zone: Zone,
 }
 
 /// Broken lines are told one by one until it is clear that the whole file is.
@@ -50,7 +53,12 @@ enum Source {
 impl ReadArgs {
     /// Opens the file, or standard input for `-`.
     pub fn open(&self, path: &Path) -> anyhow::Result<Records> {
-        let options = ReadOptions { format: self.format, follow: self.follow, strict: self.strict };
+        let options = ReadOptions {
+            format: self.format,
+            follow: self.follow,
+            strict: self.strict,
+            zone: self.zone.clone(),
+        };
         let mut reader = open_reader(path, &options)?;
         if self.follow {
             interrupt::watch()?;

@@ -38,8 +38,12 @@ fn lines(numbers: &[usize]) -> String {
 #[test]
 fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compressed() {
     let directory = directory("there_and_back");
-    for format in ["asc", "blf", "pcapng", "trc", "log"] {
-        for compression in ["", ".gz", ".zst"] {
+    for format in ["asc", "blf", "pcapng", "trc", "log", "mf4"] {
+        for compression in ["", ".gz", ".zst", ".xz", ".lz4"] {
+            // Which would say that it is marked as unfinished.
+            if format == "mf4" && !compression.is_empty() {
+                continue;
+            }
             let name = format!("there.{format}{compression}");
             let (code, out, err) = cantap(&directory, &["convert", "trace.log", &name]);
             assert_eq!((code, out.as_str(), err.as_str()), (Some(0), "", ""), "{name}");
@@ -47,6 +51,34 @@ fn a_trace_comes_back_from_every_format_that_carries_everything_plain_and_compre
             assert_eq!((code, out.as_str(), err.as_str()), (Some(0), TRACE, ""), "{name}");
         }
     }
+}
+
+/// A log of BUSMASTER has the suffix of candump's, and an ASC the clock of the computer that wrote it.
+#[test]
+fn logs_of_other_programs_are_known_by_their_beginning_and_their_dates_have_the_zone_that_is_named() {
+    let directory = directory("zones");
+    let log = "***BUSMASTER Ver 2.4.0***\n***START DATE AND TIME 14:9:2014 19:14:42:0***\n***HEX***\n***SYSTEM MODE***\n\
+               19:14:42:0000 Rx 1 0x123 s 2 11 22\n";
+    fs::write(directory.join("bus.log"), log).unwrap();
+    for (zone, line) in [
+        ("UTC", "(1410722082.000000) can0 123#1122\n"),
+        ("Europe/Berlin", "(1410714882.000000) can0 123#1122\n"),
+        ("+03:00", "(1410711282.000000) can0 123#1122\n"),
+    ] {
+        let (code, out, err) = cantap(&directory, &["convert", "bus.log", "-", "--zone", zone]);
+        assert_eq!((code, out.as_str(), err.as_str()), (Some(0), line, ""), "{zone}");
+    }
+    cantap(&directory, &["convert", "trace.log", "local.asc", "--zone", "Europe/Berlin"]);
+    let asc = fs::read_to_string(directory.join("local.asc")).unwrap();
+    assert!(asc.starts_with("date Sun Sep 14 19:14:42.000 2014\n"), "{asc}");
+    let (_, out, _) = cantap(&directory, &["convert", "local.asc", "-", "--zone", "Europe/Berlin"]);
+    assert_eq!(out, TRACE);
+    let (code, _, err) = cantap(&directory, &["stats", "bus.log", "--zone", "Berlin"]);
+    assert_eq!(code, Some(2));
+    assert!(err.contains("write a name such as Europe/Berlin, an offset such as +02:00, or UTC"), "{err}");
+    let (code, _, err) = cantap(&directory, &["convert", "bus.log", "out.txt", "--to", "busmaster"]);
+    assert_eq!(code, Some(1));
+    assert!(err.contains("only read") && !directory.join("out.txt").exists(), "{err}");
 }
 
 #[test]

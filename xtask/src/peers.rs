@@ -1,4 +1,4 @@
-//! Other people's programs: those that the tests compare ours with (can-utils, tshark, python-can, cantools), and the spelling checker.
+//! Other people's programs: those that the tests compare ours with (can-utils, tshark, python-can, cantools, asammdf), and the spelling checker.
 
 use std::path::PathBuf;
 

@@ -6,7 +6,8 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{
-    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, create_writer,
+    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
+    create_writer,
 };
 use cantap_trace::filter::Filter;
 
@@ -21,8 +22,12 @@ use crate::interrupt;
     cantap convert day.blf part.csv --start 10m --end 20m --channel 1\n  \
     cantap convert trace.pcapng old.trc --format trc1.1\n  \
     cantap convert - days.log.zst --rotate 100M --keep 10\n\n\
-    Names end in .log, .asc, .blf, .trc, .csv, .pcapng or .dif; .gz and .zst behind that compress. Dates in \
-    ASC, TRC and BLF are UTC.\n\n\
+    Names end in .log, .asc, .blf, .trc, .csv, .pcapng, .mf4 or .dif; .gz, .zst, .xz and .lz4 behind that compress. \
+    Files of any other program are known by their beginning.\n\n\
+    Dates in ASC, TRC, BLF and some logs are the clock of the computer that wrote them: name its zone with --zone.\n\n\
+    Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, pcapng, \
+    mf4, dif. Only read: pcap, csv-gvret (SavvyCAN), candump-screen, busmaster, crtd, kvaser, microchip, canhacker, \
+    printer (python-can).\n\n\
     What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, or with --strict \
     something in IN was wrong.")]
 pub struct Args {
@@ -35,7 +40,7 @@ pub struct Args {
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Any of several.
     #[arg(value_name = "FILTER")]
     filters: Vec<Filter>,
-    /// The format of IN, where neither its name nor its beginning tell.
+    /// The format of IN, where neither its name nor its beginning tell. All are listed below.
     #[arg(long, value_name = "FORMAT")]
     from: Option<Format>,
     /// Wait for more at the end of IN, until Ctrl-C.
@@ -67,7 +72,7 @@ pub struct Args {
 #[derive(clap::Args)]
 pub struct WriteArgs {
     /// The format to write, where the file's name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
-    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, dif.
+    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, mf4, dif.
     #[arg(long, visible_alias = "to", value_name = "FORMAT")]
     format: Option<Format>,
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
@@ -88,6 +93,9 @@ pub struct WriteArgs {
     /// What VECTORS counts in DIF, and whether V or an empty line follows a number: columns and V, or rows.
     #[arg(long, value_name = "CONVENTION", default_value = "columns", value_parser = ["columns", "rows"])]
     dif: String,
+    /// The time zone of dates in files that name none, read or written: Europe/Berlin, +02:00.
+    #[arg(long, value_name = "ZONE", default_value_t)]
+    pub zone: Zone,
 }
 
 fn character(text: &str) -> Result<u8, String> {
@@ -110,7 +118,7 @@ impl WriteArgs {
         let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
         let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
         let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
-        Ok(WriteOptions { format: self.format.or(implied), rotation, table })
+        Ok(WriteOptions { format: self.format.or(implied), rotation, table, zone: self.zone.clone() })
     }
 }
 
@@ -131,7 +139,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
     let options = args.write.options(None)?;
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
-    let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter };
+    let zone = args.write.zone.clone();
+    let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter, zone };
     let mut records = read.open(&args.input)?;
     if records.end_when(interrupt::requested) {
         interrupt::watch()?;

@@ -107,6 +107,16 @@ mod tests {
         assert_eq!(first("30 15:10:00.000 2017", "599.5"), "(1506784199.500000) can0 123#\n");
     }
 
+    /// As programs write on a computer whose language has it.
+    #[test]
+    fn a_comma_in_front_of_fractions_is_read() {
+        let file =
+            "date Sam Sep 30 15:06:13,191 2017\nbase hex  timestamps absolute\n   0,015991 1 123 Rx d 1 0A\n";
+        let (records, issues) = tests::read(Format::Asc, file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(tests::write(Format::Candump, &records), "(1506783973.206991) can0 123#0A\n");
+    }
+
     #[test]
     fn broken_lines_are_named() {
         let (log, issues) = as_log(

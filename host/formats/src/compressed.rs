@@ -2,50 +2,39 @@
 
 use std::fs::File;
 use std::io::{self, Write};
-use std::path::Path;
+use std::time::{Duration, Instant};
+
+use super::compression::Compression;
+#[cfg(not(feature = "zstd"))]
+use super::compression::without_zstd;
 
 /// Compression that leaves a slow machine time to capture: level 1 of 9.
 const GZIP_LEVEL: u32 = 1;
 /// zstd's own default.
 #[cfg(feature = "zstd")]
 const ZSTD_LEVEL: i32 = 3;
+/// xz is for archives; with its default a conversion would take minutes.
+const XZ_PRESET: u32 = 1;
 /// Compressed bytes are kept until so many are together or until a flush.
 const COMPRESSED_BYTES: usize = 512 * 1024;
+/// Of a file that is cut, a reader gets the blocks that are whole. zstd's own have 128 KiB, which can be all of a capture.
+const BLOCK_BYTES: usize = 16 * 1024;
+/// The encoder of xz keeps what it made until its stream ends: that is after so many bytes at the latest. It is for archives,
+/// and shorter streams would be larger than gzip's.
+const XZ_STREAM_BYTES: usize = 1024 * 1024;
+/// What a program that is killed loses at most, where nothing asks for a flush.
+const KEPT_BACK: Duration = Duration::from_secs(1);
 
-/// How a path's last suffix says to compress.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Compression {
-    None,
-    Gzip,
-    Zstd,
-}
-
-impl Compression {
-    /// By suffix: `.gz`, `.zst`.
-    pub(crate) fn of(path: &Path) -> Self {
-        match path.extension().and_then(|suffix| suffix.to_str()) {
-            Some(suffix) if suffix.eq_ignore_ascii_case("gz") => Self::Gzip,
-            Some(suffix) if suffix.eq_ignore_ascii_case("zst") => Self::Zstd,
-            _ => Self::None,
-        }
-    }
-}
-
-/// What a build without zstd says to such a file.
-#[cfg(not(feature = "zstd"))]
-pub(crate) fn without_zstd() -> io::Error {
-    let reason = "this build has no zstd; build it with the feature `zstd`, or use gzip";
-    io::Error::new(io::ErrorKind::Unsupported, reason)
-}
-
-/// A compressed file. A flush ends what gzip calls a member and zstd a frame, and the next bytes begin another: until then
-/// they stay in memory, so that the file is whole whenever this program ends.
+/// A compressed file. A flush ends what gzip calls a member and xz a stream, and the others a frame, and the next bytes begin
+/// another: until then they stay in memory, so that the file is whole whenever this program ends.
 pub(crate) struct Compressed {
     file: File,
     compression: Compression,
     encoder: Encoder,
-    /// Whether the encoder was given anything since the last flush.
-    begun: bool,
+    /// Bytes that the encoder was given since the last flush, and since the last end of a block.
+    begun: usize,
+    in_block: usize,
+    flushed: Instant,
     written: u64,
 }
 
@@ -53,28 +42,58 @@ enum Encoder {
     Gzip(flate2::write::GzEncoder<Vec<u8>>),
     #[cfg(feature = "zstd")]
     Zstd(zstd::stream::write::Encoder<'static, Vec<u8>>),
+    Lz4(lz4_flex::frame::FrameEncoder<Vec<u8>>),
+    Xz(lzma_rust2::XzWriter<Vec<u8>>),
 }
 
 impl Encoder {
     fn new(compression: Compression) -> io::Result<Self> {
+        let out = Vec::new();
         Ok(match compression {
+            Compression::Gzip => {
+                Self::Gzip(flate2::write::GzEncoder::new(out, flate2::Compression::new(GZIP_LEVEL)))
+            }
             #[cfg(feature = "zstd")]
-            Compression::Zstd => Self::Zstd(zstd::stream::write::Encoder::new(Vec::new(), ZSTD_LEVEL)?),
+            Compression::Zstd => Self::Zstd(zstd::stream::write::Encoder::new(out, ZSTD_LEVEL)?),
             #[cfg(not(feature = "zstd"))]
             Compression::Zstd => return Err(without_zstd()),
-            Compression::Gzip | Compression::None => {
-                let level = flate2::Compression::new(GZIP_LEVEL);
-                Self::Gzip(flate2::write::GzEncoder::new(Vec::new(), level))
+            Compression::Lz4 => Self::Lz4(lz4_flex::frame::FrameEncoder::new(out)),
+            Compression::Xz => {
+                let options = lzma_rust2::XzOptions::with_preset(XZ_PRESET);
+                Self::Xz(lzma_rust2::XzWriter::new(out, options)?)
             }
         })
     }
 
-    /// What came out and was not taken.
-    fn out(&mut self) -> &mut Vec<u8> {
+    /// What compresses, as any writer.
+    fn writer(&mut self) -> &mut dyn Write {
         match self {
-            Self::Gzip(encoder) => encoder.get_mut(),
+            Self::Gzip(encoder) => encoder,
             #[cfg(feature = "zstd")]
-            Self::Zstd(encoder) => encoder.get_mut(),
+            Self::Zstd(encoder) => encoder,
+            Self::Lz4(encoder) => encoder,
+            Self::Xz(encoder) => encoder,
+        }
+    }
+
+    /// What came out and was not taken, where the encoder shows it.
+    fn out(&mut self) -> Option<&mut Vec<u8>> {
+        match self {
+            Self::Gzip(encoder) => Some(encoder.get_mut()),
+            #[cfg(feature = "zstd")]
+            Self::Zstd(encoder) => Some(encoder.get_mut()),
+            Self::Lz4(encoder) => Some(encoder.get_mut()),
+            Self::Xz(_) => None,
+        }
+    }
+
+    fn finish(self) -> io::Result<Vec<u8>> {
+        match self {
+            Self::Gzip(encoder) => encoder.finish(),
+            #[cfg(feature = "zstd")]
+            Self::Zstd(encoder) => encoder.finish(),
+            Self::Lz4(encoder) => Ok(encoder.finish()?),
+            Self::Xz(encoder) => encoder.finish(),
         }
     }
 }
@@ -82,52 +101,65 @@ impl Encoder {
 impl Compressed {
     /// An empty file.
     pub(crate) fn new(file: File, compression: Compression) -> io::Result<Self> {
-        Ok(Self { file, compression, encoder: Encoder::new(compression)?, begun: false, written: 0 })
+        let encoder = Encoder::new(compression)?;
+        let flushed = Instant::now();
+        Ok(Self { file, compression, encoder, begun: 0, in_block: 0, flushed, written: 0 })
     }
 
     /// Takes bytes to be compressed.
     pub(crate) fn write(&mut self, bytes: &[u8]) -> io::Result<()> {
-        self.begun |= !bytes.is_empty();
-        match &mut self.encoder {
-            Encoder::Gzip(encoder) => encoder.write_all(bytes)?,
-            #[cfg(feature = "zstd")]
-            Encoder::Zstd(encoder) => encoder.write_all(bytes)?,
+        for piece in bytes.chunks(BLOCK_BYTES) {
+            self.encoder.writer().write_all(piece)?;
+            self.begun += piece.len();
+            self.in_block += piece.len();
+            if self.in_block >= BLOCK_BYTES {
+                self.in_block = 0;
+                // gzip's blocks are short enough, and a reader gets what is whole of them too.
+                if matches!(self.compression, Compression::Zstd | Compression::Lz4) {
+                    self.encoder.writer().flush()?;
+                }
+            }
         }
-        if self.encoder.out().len() >= COMPRESSED_BYTES { self.take_out() } else { Ok(()) }
+        let stream_is_long = self.compression == Compression::Xz && self.begun >= XZ_STREAM_BYTES;
+        if stream_is_long || self.flushed.elapsed() >= KEPT_BACK {
+            return self.flush();
+        }
+        if self.encoder.out().is_some_and(|out| out.len() >= COMPRESSED_BYTES) {
+            self.take_out()?;
+        }
+        Ok(())
     }
 
     /// How large the file is, with what is to be written next. What the encoder still holds is not in it.
     pub(crate) fn size(&mut self) -> u64 {
-        self.written + self.encoder.out().len() as u64
+        self.written + self.encoder.out().map_or(0, |out| out.len() as u64)
     }
 
     fn take_out(&mut self) -> io::Result<()> {
-        let out = self.encoder.out();
+        let Some(out) = self.encoder.out() else { return Ok(()) };
         self.file.write_all(out)?;
         self.written += out.len() as u64;
         out.clear();
         Ok(())
     }
 
-    /// Ends the member or frame, if there is anything in it.
+    /// Ends the member, stream or frame, if there is anything in it.
     pub(crate) fn flush(&mut self) -> io::Result<()> {
-        if !std::mem::take(&mut self.begun) {
-            return Ok(());
-        }
-        let rest = match std::mem::replace(&mut self.encoder, Encoder::new(self.compression)?) {
-            Encoder::Gzip(encoder) => encoder.finish()?,
-            #[cfg(feature = "zstd")]
-            Encoder::Zstd(encoder) => encoder.finish()?,
-        };
+        if std::mem::take(&mut self.begun) > 0 { self.end() } else { Ok(()) }
+    }
+
+    fn end(&mut self) -> io::Result<()> {
+        let rest = std::mem::replace(&mut self.encoder, Encoder::new(self.compression)?).finish()?;
         self.file.write_all(&rest)?;
         self.written += rest.len() as u64;
+        self.in_block = 0;
+        self.flushed = Instant::now();
         Ok(())
     }
 
     /// Ends the file.
     pub(crate) fn finish(mut self) -> io::Result<()> {
         // A file without anything in it is a compressed one all the same.
-        self.begun |= self.written == 0;
-        self.flush()
+        if self.begun > 0 || self.written == 0 { self.end() } else { Ok(()) }
     }
 }

@@ -14,10 +14,12 @@ use super::codec::{Decode, Encode};
 use super::error_frames::ErrorFrames;
 use super::event_text::EventText;
 use super::found::{Found, Row};
+use super::gvret;
 use super::input::Input;
 use super::issue::{Fault, Place};
 use super::left_out::LeftOut;
 use super::text::{self, NS_PER_S};
+use super::zone::Zone;
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -32,6 +34,8 @@ pub enum CsvDialect {
     Full,
     /// The earlier CANanalyser's.
     Analyser,
+    /// SavvyCAN's.
+    Gvret,
 }
 
 const PYTHON_CAN_HEAD: &str = "timestamp,arbitration_id,extended,remote,error,dlc,data";
@@ -44,10 +48,18 @@ const FULL_HEAD: &str = "time,channel,direction,type,id,dlc,data,event";
 pub(crate) struct Decoder {
     dialect: Option<CsvDialect>,
     analyser: analyser::RowDecoder,
+    gvret: gvret::RowDecoder,
     /// Lines before the head that may be the analyser's comments, and what is wrong if they are not.
     comments: u32,
     no_head: Option<(Place, Fault)>,
     error_frames: ErrorFrames,
+}
+
+impl Decoder {
+    /// With the zone of the file's date, if it has one.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { analyser: analyser::RowDecoder::new(zone), ..Self::default() }
+    }
 }
 
 impl Decode for Decoder {
@@ -65,6 +77,7 @@ impl Decode for Decoder {
                 Some(CsvDialect::PythonCan) => python_can(text, &mut self.error_frames),
                 Some(CsvDialect::Full) => full(text).map(|record| Some((record, None))),
                 Some(CsvDialect::Analyser) => self.analyser.line(text, line.terminated),
+                Some(CsvDialect::Gvret) => self.gvret.line(text),
             };
             if !line.terminated && self.may_be_cut(text, &result) {
                 return Ok(line.cut());
@@ -102,6 +115,8 @@ impl Decoder {
         match self.dialect {
             Some(CsvDialect::Full) => !is_frame || !(row.ends_with(b",") || row.ends_with(b",late")),
             Some(CsvDialect::PythonCan) => !is_frame && !row.ends_with(b"="),
+            // Its rows end with a comma.
+            Some(CsvDialect::Gvret) => !row.ends_with(b","),
             Some(CsvDialect::Analyser) | None => false,
         }
     }
@@ -111,6 +126,8 @@ impl Decoder {
             self.dialect = Some(CsvDialect::PythonCan);
         } else if line == FULL_HEAD.as_bytes() {
             self.dialect = Some(CsvDialect::Full);
+        } else if self.gvret.head(line) {
+            self.dialect = Some(CsvDialect::Gvret);
         } else if self.analyser.head(line) {
             self.dialect = Some(CsvDialect::Analyser);
         } else {

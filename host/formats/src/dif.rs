@@ -12,6 +12,7 @@ use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place};
 use super::output::Patch;
+use super::zone::Zone;
 use cantap_trace::{TraceEvent, TraceRecord};
 
 /// The number of rows has a fixed width, so that it can be put in at the end.
@@ -133,6 +134,13 @@ pub(crate) struct Decoder {
     ended: bool,
 }
 
+impl Decoder {
+    /// With the zone of the file's date.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { rows: RowDecoder::new(zone), ..Self::default() }
+    }
+}
+
 impl Decode for Decoder {
     fn needs_one_line(&self) -> bool {
         false
@@ -143,6 +151,12 @@ impl Decode for Decoder {
             return Ok(Found::Record(record));
         }
         while !self.ended {
+            if self.named
+                && self.cells.is_empty()
+                && let Some(found) = self.whole_row(input)
+            {
+                return Ok(found);
+            }
             let place = Place::Line(input.line_number() + 1);
             let Some(first) = input.line()? else {
                 self.ended = true;
@@ -182,11 +196,66 @@ impl Decode for Decoder {
                 Err(fault) => return Ok(Found::Issue(row_place, fault)),
             }
         }
+        // Whether a compressed file is whole is known at its end.
+        while !input.may_wait() && !input.peek(1)?.is_empty() {
+            input.consume(input.buffered().len());
+        }
         Ok(Found::End)
     }
 }
 
+/// A line of the buffer without its end and the space around it.
+#[inline]
+fn trimmed(line: &[u8]) -> &[u8] {
+    match line {
+        // As most lines are.
+        [b'!'..=b'~', .., b'!'..=b'~', b'\r'] => &line[..line.len() - 1],
+        [b'!'..=b'~', .., b'!'..=b'~'] => line,
+        _ => line.trim_ascii(),
+    }
+}
+
 impl Decoder {
+    /// A row that is in the buffer from its first cell to the beginning of the next, as nearly all are, read without copying
+    /// a cell. `None` if there is none such; then its lines are read one by one.
+    fn whole_row(&mut self, input: &mut Input) -> Option<Found> {
+        let buffered = input.buffered();
+        let mut ends = memchr::memchr_iter(b'\n', buffered);
+        let mut cells = [&b""[..]; COLUMNS.len() + 1];
+        let (mut count, mut begin, mut lines) = (0, 0, 0);
+        loop {
+            let (first_end, second_end) = (ends.next()?, ends.next()?);
+            let (first, second) = (&buffered[begin..first_end], &buffered[first_end + 1..second_end]);
+            begin = second_end + 1;
+            lines += 2;
+            let cell = match trimmed(first) {
+                [b'0', b',', number @ ..] => number,
+                [b'1', b',', ..] => match trimmed(second) {
+                    [b'"', text @ .., b'"'] | text => text,
+                },
+                b"-1,0" if trimmed(second) == b"BOT" => break,
+                _ => return None,
+            };
+            *cells.get_mut(count)? = cell;
+            count += 1;
+        }
+        if count == 0 {
+            return None;
+        }
+        let row = self.rows.cells(&cells[..count], b"an incomplete row");
+        let place = Place::Line(self.row_line);
+        input.consume_lines(begin, lines);
+        self.row_line = input.line_number() + 1;
+        match row {
+            Ok(Some((record, second))) => {
+                self.pending = second.map(|event| TraceRecord { event, ..record });
+                Some(Found::Record(record))
+            }
+            Ok(None) => None,
+            Err(fault) => Some(Found::Issue(place, fault)),
+        }
+    }
+
     /// An item of the header: a name, its number, its text.
     fn header(&mut self, name: &[u8], input: &mut Input) -> io::Result<Option<Fault>> {
         let known = !name.is_empty() && name.iter().all(u8::is_ascii_uppercase);

@@ -40,7 +40,12 @@ impl ErrorFrames {
         if let Some(record) = self.records.pop_front() {
             return Some(Found::Record(record));
         }
+        self.note().map(Found::Note)
+    }
+
+    /// What is to be told of the frames that were read.
+    pub(super) fn note(&mut self) -> Option<&'static str> {
         self.untold = self.untold.checked_sub(1)?;
-        Some(Found::Note(DETAILS_LEFT_OUT))
+        Some(DETAILS_LEFT_OUT)
     }
 }

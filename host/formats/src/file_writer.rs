@@ -7,10 +7,11 @@ use super::analyser::{CsvLayout, TableEncoder};
 use super::codec::Encode;
 use super::csv::CsvDialect;
 use super::dif::DifLayout;
+use super::format::NotWritten;
 use super::left_out::LeftOut;
 use super::output::Output;
 use super::writer::{TraceWriter, WriteOptions};
-use super::{Format, asc, blf, candump, csv, pcapng, trc};
+use super::{Format, asc, blf, candump, csv, mf4, pcapng, trc};
 use cantap_trace::{TraceEvent, TraceRecord};
 
 /// Bytes collected before they go to the system.
@@ -38,24 +39,38 @@ fn format_of(path: &Path, options: &WriteOptions) -> io::Result<Format> {
     }
 }
 
+/// What writes a format. The error names those that are written, for one that is only read.
+fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Encode>> {
+    Ok(match format {
+        Format::Candump => Box::new(candump::Encoder::default()),
+        Format::Asc => Box::new(asc::Encoder::new(&options.zone)),
+        Format::Blf => Box::new(blf::Encoder::new(&options.zone)),
+        Format::Trc(version) => Box::new(trc::Encoder::new(version, &options.zone)),
+        Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
+        Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
+        Format::Csv(CsvDialect::Analyser) => {
+            Box::new(TableEncoder::new(CsvLayout(options.table), &options.zone))
+        }
+        Format::Pcapng => Box::new(pcapng::Encoder::default()),
+        Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table), &options.zone)),
+        Format::Mf4 => Box::new(mf4::Encoder::default()),
+        read_only => return Err(io::Error::new(io::ErrorKind::Unsupported, NotWritten(read_only))),
+    })
+}
+
 impl FileWriter {
     pub(crate) fn create(path: &Path, options: &WriteOptions) -> io::Result<Self> {
-        let format = format_of(path, options)?;
-        Ok(Self::new(Output::create(path)?, format, options))
+        // Nothing is created, and nothing overwritten, for a format that is not written.
+        let encoder = encoder_of(format_of(path, options)?, options)?;
+        Ok(Self::with(Output::create(path)?, encoder))
     }
 
+    #[cfg(test)]
     pub(crate) fn new(output: Output, format: Format, options: &WriteOptions) -> Self {
-        let encoder: Box<dyn Encode> = match format {
-            Format::Candump => Box::new(candump::Encoder::default()),
-            Format::Asc => Box::new(asc::Encoder::default()),
-            Format::Blf => Box::new(blf::Encoder::default()),
-            Format::Trc(version) => Box::new(trc::Encoder::new(version)),
-            Format::Csv(CsvDialect::PythonCan) => Box::new(csv::PythonCanEncoder::default()),
-            Format::Csv(CsvDialect::Full) => Box::new(csv::FullEncoder::default()),
-            Format::Csv(CsvDialect::Analyser) => Box::new(TableEncoder::new(CsvLayout(options.table))),
-            Format::Pcapng => Box::new(pcapng::Encoder::default()),
-            Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table))),
-        };
+        Self::with(output, encoder_of(format, options).unwrap())
+    }
+
+    fn with(output: Output, encoder: Box<dyn Encode>) -> Self {
         let buffer = Vec::with_capacity(BUFFER_BYTES + 1024);
         Self {
             encoder,

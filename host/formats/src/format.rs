@@ -4,9 +4,12 @@ use std::fmt;
 use std::path::Path;
 use std::str::FromStr;
 
+use super::compression::Compression;
 use super::csv::CsvDialect;
 use super::trc::TrcVersion;
-use super::{blf, pcapng};
+use super::{
+    blf, busmaster, candump_screen, canhacker, crtd, gvret, kvaser, mf4, microchip, pcap, pcapng, printer,
+};
 
 /// A trace file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -24,8 +27,26 @@ pub enum Format {
     Csv(CsvDialect),
     /// Wireshark's format, with SocketCAN packets.
     Pcapng,
+    /// The older format of Wireshark and tcpdump.
+    Pcap,
     /// The earlier CANanalyser's table in the format of old spreadsheets.
     Dif,
+    /// ASAM MDF 4 with the traffic of buses, as loggers write it.
+    Mf4,
+    /// What candump shows on a screen.
+    CandumpScreen,
+    /// BUSMASTER's log.
+    Busmaster,
+    /// The log of the Open Vehicle Monitoring System.
+    Crtd,
+    /// Kvaser's text of a Memorator's log.
+    Kvaser,
+    /// The log of Microchip's CAN Bus Analyzer.
+    Microchip,
+    /// CANHacker's trace.
+    CanHacker,
+    /// What python-can's Printer prints.
+    Printer,
 }
 
 /// Names, suffixes and a description of each format. The first name is the one shown; the first
@@ -43,8 +64,18 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Csv(CsvDialect::PythonCan), &["csv", "csv-python-can"], &["csv"]),
     (Format::Csv(CsvDialect::Full), &["csv-full"], &[]),
     (Format::Csv(CsvDialect::Analyser), &["csv-analyser"], &[]),
+    (Format::Csv(CsvDialect::Gvret), &["csv-gvret", "gvret"], &[]),
     (Format::Pcapng, &["pcapng"], &["pcapng", "ntar"]),
+    (Format::Pcap, &["pcap"], &["pcap", "cap"]),
     (Format::Dif, &["dif"], &["dif"]),
+    (Format::Mf4, &["mf4"], &["mf4", "mdf"]),
+    (Format::CandumpScreen, &["candump-screen"], &[]),
+    (Format::Busmaster, &["busmaster"], &[]),
+    (Format::Crtd, &["crtd"], &["crtd", "crt"]),
+    (Format::Kvaser, &["kvaser"], &[]),
+    (Format::Microchip, &["microchip"], &["can"]),
+    (Format::CanHacker, &["canhacker"], &[]),
+    (Format::Printer, &["printer"], &[]),
 ];
 
 /// No such format.
@@ -59,10 +90,41 @@ pub enum UnknownFormat {
     Suffix(String),
 }
 
+/// A format that is read and not written.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{0} is a format that is only read; those that are written are {written}", written = Format::written_names())]
+pub struct NotWritten(pub Format);
+
 impl Format {
     /// Every format.
     pub fn all() -> impl Iterator<Item = Self> {
         FORMATS.iter().map(|(format, ..)| *format)
+    }
+
+    /// Whether files of the format are written, and not only read.
+    pub fn is_written(self) -> bool {
+        !matches!(
+            self,
+            Self::Csv(CsvDialect::Gvret)
+                | Self::Pcap
+                | Self::CandumpScreen
+                | Self::Busmaster
+                | Self::Crtd
+                | Self::Kvaser
+                | Self::Microchip
+                | Self::CanHacker
+                | Self::Printer
+        )
+    }
+
+    /// Every format that is written.
+    pub fn written() -> impl Iterator<Item = Self> {
+        Self::all().filter(|format| format.is_written())
+    }
+
+    /// The names of the formats that are written, for messages.
+    pub fn written_names() -> String {
+        Self::written().map(|format| format.to_string()).collect::<Vec<_>>().join(", ")
     }
 
     /// The names of all formats, for messages.
@@ -70,10 +132,10 @@ impl Format {
         FORMATS.iter().map(|(_, names, _)| names[0]).collect::<Vec<_>>().join(", ")
     }
 
-    /// By a path's suffix; `.gz` and `.zst` are looked through.
+    /// By a path's suffix; `.gz`, `.zst`, `.xz` and `.lz4` are looked through.
     pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
-        let bare = name.strip_suffix(".gz").or_else(|| name.strip_suffix(".zst")).unwrap_or(&name);
+        let (bare, _) = Compression::split(&name);
         bare.rsplit_once('.')
             .and_then(|(_, suffix)| FORMATS.iter().find(|(_, _, suffixes)| suffixes.contains(&suffix)))
             .map(|(format, ..)| *format)
@@ -82,9 +144,16 @@ impl Format {
 
     /// By a file's first bytes.
     pub fn of_content(head: &[u8]) -> Option<Self> {
-        let text = head.trim_ascii_start();
+        /// Where the head of a log names its program.
+        const HEAD_BYTES: usize = 1024;
+        let text = head[..head.len().min(HEAD_BYTES)].trim_ascii_start();
+        let line = text.split(|byte| *byte == b'\n').next().unwrap_or_default().trim_ascii_end();
         if head.starts_with(blf::FILE_MAGIC) {
             Some(Self::Blf)
+        } else if head.starts_with(mf4::FILE_MAGIC) || head.starts_with(mf4::UNFINISHED_MAGIC) {
+            Some(Self::Mf4)
+        } else if pcap::is_head(head) {
+            Some(Self::Pcap)
         } else if head.starts_with(&pcapng::SECTION_HEADER.to_le_bytes()) {
             Some(Self::Pcapng)
         } else if text.starts_with(b"timestamp,") || text.starts_with(b"time,") || text.starts_with(b"Index")
@@ -92,6 +161,22 @@ impl Format {
             Some(Self::Csv(CsvDialect::PythonCan))
         } else if text.starts_with(b"TABLE") {
             Some(Self::Dif)
+        } else if gvret::is_head(line) {
+            Some(Self::Csv(CsvDialect::Gvret))
+        } else if busmaster::is_head(text) {
+            Some(Self::Busmaster)
+        } else if kvaser::is_head(text) {
+            Some(Self::Kvaser)
+        } else if microchip::is_head(text) {
+            Some(Self::Microchip)
+        } else if canhacker::is_head(line) {
+            Some(Self::CanHacker)
+        } else if printer::is_line(line) {
+            Some(Self::Printer)
+        } else if candump_screen::is_line(line) {
+            Some(Self::CandumpScreen)
+        } else if crtd::is_line(line) {
+            Some(Self::Crtd)
         } else if text.starts_with(b"(") {
             Some(Self::Candump)
         } else if text.starts_with(b"date ") {
@@ -121,5 +206,54 @@ impl FromStr for Format {
             .find(|(_, names, _)| names.contains(&lower.as_str()))
             .map(|(format, ..)| *format)
             .ok_or_else(|| UnknownFormat::Name(text.to_owned()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn files_are_known_by_their_beginning() {
+        let utf8 = |text: &str| text.as_bytes().to_vec();
+        for (head, format) in [
+            (utf8("(1410714882.622188) can0 123#11\n"), Format::Candump),
+            (utf8("date Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
+            (utf8(";$FILEVERSION=1.1\n"), Format::Trc(TrcVersion::V2_1)),
+            (utf8("LOGG\0\0\0\0"), Format::Blf),
+            (utf8("MDF     4.10    "), Format::Mf4),
+            (utf8("UnFinMF 4.11    "), Format::Mf4),
+            (vec![0x0A, 0x0D, 0x0D, 0x0A], Format::Pcapng),
+            (vec![0xD4, 0xC3, 0xB2, 0xA1], Format::Pcap),
+            (vec![0xA1, 0xB2, 0x3C, 0x4D], Format::Pcap),
+            (utf8("Time Stamp,ID,Extended,Dir,Bus,LEN,D1\n"), Format::Csv(CsvDialect::Gvret)),
+            (utf8("timestamp,arbitration_id,extended\n"), Format::Csv(CsvDialect::PythonCan)),
+            (utf8("  can0  123   [8]  11 22 33 44 55 66 77 88\n"), Format::CandumpScreen),
+            (utf8(" (000.000000)  can0  RX - -  12345678   [0]\n"), Format::CandumpScreen),
+            (utf8("***BUSMASTER Ver 2.4.0***\n"), Format::Busmaster),
+            (utf8("1320745424.000 CXX OVMS converted log\n"), Format::Crtd),
+            (utf8("123.431 2R11 27E 00\n"), Format::Crtd),
+            (utf8("                              Kvaser Memorator Log\n"), Format::Kvaser),
+            (utf8("//-----\nMicrochip Technology Inc.\n"), Format::Microchip),
+            (utf8("Time   ID     DLC Data                    Comment\n"), Format::CanHacker),
+            (utf8("Timestamp: 1410714882.000000    ID:      123    S Rx"), Format::Printer),
+        ] {
+            assert_eq!(Format::of_content(&head), Some(format), "{}", String::from_utf8_lossy(&head));
+        }
+        for head in ["", "rubbish", "   0.015991 1 123 Rx d 1 0A", "[8]", "{}"] {
+            assert_eq!(Format::of_content(head.as_bytes()), None, "{head}");
+        }
+    }
+
+    #[test]
+    fn a_format_that_is_only_read_is_not_written_and_nothing_is_created() {
+        let dir = tempfile::tempdir().unwrap();
+        for format in Format::all().filter(|format| !format.is_written()) {
+            let path = dir.path().join("a");
+            let options = crate::WriteOptions { format: Some(format), ..Default::default() };
+            let error = crate::create_writer(&path, &options).err().unwrap().to_string();
+            assert!(error.contains("only read") && error.contains("mf4"), "{error}");
+            assert!(!path.exists());
+        }
     }
 }

@@ -6,8 +6,12 @@ use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
+use super::compression::{self, Compression};
 use super::found::Found;
 use super::issue::{Fault, Place};
+use super::utf16::{self, ToUtf8, Utf16};
+use super::whole::{MAX_MEMORY_BYTES, Whole};
+use super::zone::Zone;
 
 /// Bytes asked of the system at a time.
 const CHUNK_BYTES: usize = 256 * 1024;
@@ -37,6 +41,11 @@ pub(crate) struct Input {
     ended: bool,
     cut: bool,
     stop: Box<dyn Fn() -> bool + Send>,
+    /// The same file again, where it is a plain one: for formats that are read at any place.
+    file: Option<File>,
+    /// Whether its bytes are the file's, neither unpacked nor turned into others.
+    is_as_it_is: bool,
+    zone: Zone,
 }
 
 /// One line, without its end.
@@ -83,10 +92,13 @@ impl Input {
             ended: false,
             cut: false,
             stop: Box::new(|| false),
+            file: None,
+            is_as_it_is: true,
+            zone: Zone::default(),
         }
     }
 
-    /// Opens a file, or standard input for `-`; recognises gzip and zstd by their first bytes.
+    /// Opens a file, or standard input for `-`; recognises compression by the first bytes.
     pub(crate) fn open(path: &Path, follow: bool) -> io::Result<Self> {
         if path.as_os_str() == "-" {
             // The end of a pipe is final.
@@ -98,27 +110,24 @@ impl Input {
         }
         let file = File::open(path)?;
         let is_file = file.metadata()?.is_file();
+        let same = if is_file { Some(file.try_clone()?) } else { None };
         let mut input = Self::decompressing(Box::new(file), follow)?;
         input.may_wait = follow || !is_file;
+        input.file = same.filter(|_| input.is_as_it_is);
         Ok(input)
     }
 
-    /// Reads from a source that may be compressed.
+    /// Reads from a source that may be compressed, or a text in UTF-16.
     pub(crate) fn decompressing(source: Box<dyn Read + Send>, follow: bool) -> io::Result<Self> {
         let mut input = Self::new(source, follow);
-        let head = input.peek(4)?;
-        if head.starts_with(&[0x1F, 0x8B]) {
-            let decoder = flate2::read::MultiGzDecoder::new(input.into_rest());
-            return Self::new(Box::new(decoder), false).without_byte_order_mark();
+        if let Some(compression) = Compression::of_content(input.peek(compression::MAGIC_BYTES)?) {
+            input = Self::new(compression.unpack(input.into_rest())?, false);
+            input.is_as_it_is = false;
         }
-        if head.starts_with(&[0x28, 0xB5, 0x2F, 0xFD]) {
-            #[cfg(not(feature = "zstd"))]
-            return Err(crate::compressed::without_zstd());
-            #[cfg(feature = "zstd")]
-            {
-                let decoder = zstd::stream::read::Decoder::new(input.into_rest())?;
-                return Self::new(Box::new(decoder), false).without_byte_order_mark();
-            }
+        if let Some(order) = Utf16::of_content(input.peek(utf16::HEAD_BYTES)?) {
+            let follow = input.follow;
+            input = Self::new(Box::new(ToUtf8::new(input.into_rest(), order, follow)), follow);
+            input.is_as_it_is = false;
         }
         input.without_byte_order_mark()
     }
@@ -136,6 +145,38 @@ impl Input {
     fn into_rest(self) -> impl Read + Send {
         let buffered = self.buffer[self.start..self.end].to_vec();
         io::Cursor::new(buffered).chain(self.source)
+    }
+
+    /// All of it, for formats that are read at any place: the file itself, or a copy in memory of what was compressed or comes
+    /// through a pipe. Nothing may be used up before.
+    pub(crate) fn whole(&mut self) -> io::Result<Whole> {
+        if let Some(file) = self.file.take() {
+            self.consume(self.buffered().len());
+            self.ended = true;
+            return Whole::new(Box::new(file));
+        }
+        let mut bytes = self.buffered().to_vec();
+        self.consume(bytes.len());
+        while self.fill()? {
+            bytes.extend_from_slice(self.buffered());
+            self.consume(self.buffered().len());
+            if bytes.len() as u64 > MAX_MEMORY_BYTES {
+                let message =
+                    "it is larger than 1 GiB and is read at many places; unpack it into a file first";
+                return Err(io::Error::new(io::ErrorKind::OutOfMemory, message));
+            }
+        }
+        Whole::new(Box::new(io::Cursor::new(bytes)))
+    }
+
+    /// The zone of dates in a file that names none.
+    pub(crate) fn zone(&self) -> &Zone {
+        &self.zone
+    }
+
+    /// Sets the zone of dates.
+    pub(crate) fn set_zone(&mut self, zone: Zone) {
+        self.zone = zone;
     }
 
     /// Ends the input as soon as this is true.
@@ -302,6 +343,19 @@ mod tests {
         let zstd = zstd::stream::encode_all(text.as_bytes(), 1).unwrap();
         for bytes in [text.as_bytes().to_vec(), zstd] {
             assert_eq!(lines(input(bytes)), [(1, "a".into(), true), (2, "b".into(), true)]);
+        }
+    }
+
+    #[cfg(feature = "zstd")]
+    #[test]
+    fn utf16_is_read_as_any_text_also_when_it_is_compressed() {
+        let text = "a\r\nµ\n";
+        let little: Vec<u8> = text.encode_utf16().flat_map(u16::to_le_bytes).collect();
+        let big: Vec<u8> = text.encode_utf16().flat_map(u16::to_be_bytes).collect();
+        let marked = [&[0xFF, 0xFE][..], &little].concat();
+        let packed = zstd::stream::encode_all(&marked[..], 1).unwrap();
+        for bytes in [marked, [&[0xFE, 0xFF][..], &big].concat(), little, big, packed] {
+            assert_eq!(lines(input(bytes)), [(1, "a".into(), true), (2, "µ".into(), true)]);
         }
     }
 

@@ -9,11 +9,16 @@
 mod analyser;
 mod asc;
 mod blf;
+mod busmaster;
 mod calendar;
 mod candump;
+mod candump_screen;
+mod canhacker;
 mod codec;
 mod compressed;
+mod compression;
 mod create;
+mod crtd;
 mod csv;
 mod dif;
 mod error_frames;
@@ -21,35 +26,48 @@ mod event_text;
 mod file_writer;
 mod format;
 mod found;
+mod frame_fields;
+mod gvret;
 mod input;
 mod interfaces;
 mod issue;
+mod kvaser;
 mod left_out;
 mod line;
+mod mf4;
+mod microchip;
 mod output;
+mod pcap;
 mod pcapng;
+mod printer;
 mod reader;
 mod rotate;
 mod rotation;
+mod row_format;
 mod sja1000;
+mod socketcan_packet;
 #[cfg(test)]
 mod tests;
 mod text;
 pub mod time_range;
 mod trc;
+mod utf16;
+mod whole;
 mod writer;
+mod zone;
 
 pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
 pub use create::create_writer;
 pub use csv::CsvDialect;
-pub use format::{Format, UnknownFormat};
+pub use format::{Format, NotWritten, UnknownFormat};
 pub use issue::{Fault, Place, ReadIssue};
 pub use left_out::LeftOut;
 pub use reader::{OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotation::{BadRotation, RotateAt, Rotation};
 pub use trc::TrcVersion;
 pub use writer::{TraceWriter, WriteOptions};
+pub use zone::{UnknownZone, Zone};
 
 /// Seconds with a fraction, as nanoseconds.
 pub(crate) fn decimal_seconds_ns(text: &str) -> Option<i64> {

@@ -4,7 +4,8 @@ use std::fs::File;
 use std::io::{self, Seek, SeekFrom, Write};
 use std::path::Path;
 
-use super::compressed::{Compressed, Compression};
+use super::compressed::Compressed;
+use super::compression::Compression;
 
 /// A destination of bytes.
 pub(crate) enum Output {
@@ -38,11 +39,11 @@ impl Output {
             return Ok(Self::Stream(Box::new(io::stdout())));
         }
         let file = File::create(path)?;
-        Ok(match Compression::of(path) {
+        Ok(match Compression::of_path(path) {
             // A pipe or device has no place to go back to.
-            Compression::None if !file.metadata()?.is_file() => Self::Stream(Box::new(file)),
-            Compression::None => Self::File { file, written: 0, extent: 0 },
-            compression => Self::Compressed(Box::new(Compressed::new(file, compression)?)),
+            None if !file.metadata()?.is_file() => Self::Stream(Box::new(file)),
+            None => Self::File { file, written: 0, extent: 0 },
+            Some(compression) => Self::Compressed(Box::new(Compressed::new(file, compression)?)),
         })
     }
 

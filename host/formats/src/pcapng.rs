@@ -24,9 +24,6 @@ const BYTE_ORDER_MAGIC: u32 = 0x1A2B_3C4D;
 /// A block's type and length in front, and its length again behind.
 const BLOCK_FRAME_BYTES: usize = 12;
 
-/// SocketCAN's link type.
-const LINK_TYPE: u16 = 227;
-
 // Options.
 const END: u16 = 0;
 const IF_NAME: u16 = 2;
@@ -39,15 +36,6 @@ const SHB_USERAPPL: u16 = 4;
 /// The direction's bits in a packet's flags, and the value for a sent packet.
 const DIRECTION: u32 = 3;
 const OUTBOUND: u32 = 2;
-
-// Flags in a SocketCAN identifier, which stands in network byte order.
-const EXTENDED: u32 = 1 << 31;
-const REMOTE: u32 = 1 << 30;
-
-/// Length of a classical packet: identifier, length, two bytes for CAN FD, the raw DLC, data.
-const PACKET_BYTES: usize = 16;
-/// Length of a CAN FD packet: the second byte behind the length has its flags.
-const FD_PACKET_BYTES: usize = 8 + 64;
 
 #[cfg(test)]
 mod tests {

@@ -9,7 +9,12 @@ use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
 use super::left_out::LeftOut;
-use super::{Format, UnknownFormat, asc, blf, candump, csv, dif, pcapng, trc};
+use super::row_format::Rows;
+use super::zone::Zone;
+use super::{
+    Format, UnknownFormat, asc, blf, busmaster, candump, candump_screen, canhacker, crtd, csv, dif, kvaser,
+    mf4, microchip, pcap, pcapng, printer, trc,
+};
 use cantap_trace::TraceRecord;
 
 /// How to read.
@@ -21,6 +26,8 @@ pub struct ReadOptions {
     pub follow: bool,
     /// End after the first issue.
     pub strict: bool,
+    /// The zone of dates in files that name none.
+    pub zone: Zone,
 }
 
 /// Why a file cannot be opened for reading.
@@ -68,22 +75,20 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
     let failed = |error| OpenError::Io(name.clone(), error);
     let mut input = Input::open(path, options.follow).map_err(failed)?;
-    let format = match options.format {
-        Some(format) => format,
-        None => match Format::of_path(path) {
-            Ok(format) => format,
-            Err(unknown) => {
-                // A pipe may give no more than a line for a long time.
-                let head =
-                    if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
-                match Format::of_content(head) {
-                    Some(format) => format,
-                    None if path.as_os_str() == "-" => Format::Candump,
-                    None => return Err(unknown.into()),
-                }
-            }
-        },
+    let format = if let Some(format) = options.format {
+        format
+    } else {
+        // A pipe may give no more than a line for a long time.
+        let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
+        match (Format::of_path(path), Format::of_content(head)) {
+            // The logs of other programs share their suffixes with formats of ours.
+            (_, Some(content)) if !content.is_written() => content,
+            (Ok(format), _) | (Err(_), Some(format)) => format,
+            (Err(_), None) if path.as_os_str() == "-" => Format::Candump,
+            (Err(unknown), None) => return Err(unknown.into()),
+        }
     };
+    input.set_zone(options.zone.clone());
     Ok(TraceReader::new(name.into(), format, input, options.strict))
 }
 
@@ -91,12 +96,21 @@ impl TraceReader {
     fn new(name: Arc<str>, format: Format, input: Input, strict: bool) -> Self {
         let decoder: Box<dyn Decode> = match format {
             Format::Candump => Box::new(candump::Decoder::default()),
-            Format::Asc => Box::new(asc::Decoder::default()),
-            Format::Blf => Box::new(blf::Decoder::default()),
-            Format::Trc(_) => Box::new(trc::Decoder::default()),
-            Format::Csv(_) => Box::new(csv::Decoder::default()),
+            Format::Asc => Box::new(asc::Decoder::new(input.zone())),
+            Format::Blf => Box::new(blf::Decoder::new(input.zone())),
+            Format::Trc(_) => Box::new(trc::Decoder::new(input.zone())),
+            Format::Csv(_) => Box::new(csv::Decoder::new(input.zone())),
             Format::Pcapng => Box::new(pcapng::Decoder::default()),
-            Format::Dif => Box::new(dif::Decoder::default()),
+            Format::Pcap => Box::new(pcap::Decoder::default()),
+            Format::Dif => Box::new(dif::Decoder::new(input.zone())),
+            Format::Mf4 => Box::new(mf4::Decoder::default()),
+            Format::CandumpScreen => Box::new(Rows::<candump_screen::Decoder>::default()),
+            Format::Busmaster => Box::new(Rows::<busmaster::Decoder>::default()),
+            Format::Crtd => Box::new(Rows::<crtd::Decoder>::default()),
+            Format::Kvaser => Box::new(Rows::<kvaser::Decoder>::default()),
+            Format::Microchip => Box::new(Rows::<microchip::Decoder>::default()),
+            Format::CanHacker => Box::new(Rows::<canhacker::Decoder>::default()),
+            Format::Printer => Box::new(Rows::<printer::Decoder>::default()),
         };
         let batch = Vec::with_capacity(BATCH);
         Self {
@@ -122,7 +136,8 @@ impl TraceReader {
         format: Format,
         options: &ReadOptions,
     ) -> io::Result<Self> {
-        let input = Input::decompressing(Box::new(source), options.follow)?;
+        let mut input = Input::decompressing(Box::new(source), options.follow)?;
+        input.set_zone(options.zone.clone());
         Ok(Self::new(name.into(), format, input, options.strict))
     }
 

@@ -7,6 +7,7 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use super::compression::Compression;
 use super::file_writer::FileWriter;
 use super::left_out::LeftOut;
 use super::rotation::RotateAt;
@@ -35,8 +36,7 @@ pub(crate) struct Rotating {
 /// `trace.log.gz` with number 7 is `trace-000007.log.gz`.
 fn numbered(path: &Path, number: u64) -> PathBuf {
     let name = path.file_name().unwrap_or_default().to_string_lossy().into_owned();
-    let bare =
-        name.len() - [".gz", ".zst"].iter().find(|end| name.ends_with(**end)).map_or(0, |end| end.len());
+    let bare = Compression::split(&name).0.len();
     let stem = name[..bare].rfind('.').filter(|at| *at > 0).unwrap_or(bare);
     let (stem, suffixes) = name.split_at(stem);
     path.with_file_name(OsString::from(format!("{stem}-{number:0NUMBER_DIGITS$}{suffixes}")))
@@ -136,6 +136,8 @@ mod tests {
             ("trace", "trace-000007"),
             (".log", ".log-000007"),
             ("trace.zst", "trace-000007.zst"),
+            ("trace.blf.xz", "trace-000007.blf.xz"),
+            ("trace.log.LZ4", "trace-000007.log.LZ4"),
         ] {
             assert_eq!(numbered(Path::new(path), 7), Path::new(expected));
         }

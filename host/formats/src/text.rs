@@ -270,6 +270,12 @@ pub(crate) fn time(text: &[u8], unit_ns: i64, mark: u8) -> Option<i64> {
     Some(if negative { -value } else { value })
 }
 
+/// As [`time`], with a point or a comma in front of the fraction: programs write what their computer's language has.
+#[inline]
+pub(crate) fn time_of_any_mark(text: &[u8], unit_ns: i64) -> Option<i64> {
+    time(text, unit_ns, b'.').or_else(|| time(text, unit_ns, b','))
+}
+
 /// Cuts the first word off: the word and what follows it. The word is empty at the end.
 #[inline]
 pub(crate) fn word(text: &[u8]) -> (&[u8], &[u8]) {

@@ -268,4 +268,12 @@ mod tests {
             ]
         );
     }
+
+    #[test]
+    fn a_comma_in_front_of_fractions_is_read() {
+        let file = ";$FILEVERSION=1.1\n;$STARTTIME=44548,5\n;\n     1)      1004,8  Rx         079B  1  02\n";
+        let (records, issues) = tests::read(Format::Trc(TrcVersion::V1_1), file);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(tests::write(Format::Candump, &records), "(1639828801.004800) can0 79B#02\n");
+    }
 }

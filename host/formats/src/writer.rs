@@ -6,6 +6,7 @@ use super::Format;
 use super::analyser::TableStyle;
 use super::left_out::LeftOut;
 use super::rotation::Rotation;
+use super::zone::Zone;
 use cantap_trace::TraceRecord;
 
 /// How to write.
@@ -17,6 +18,8 @@ pub struct WriteOptions {
     pub rotation: Rotation,
     /// How the earlier CANanalyser's tables look.
     pub table: TableStyle,
+    /// The zone of dates in formats that name none.
+    pub zone: Zone,
 }
 
 /// Takes records and makes a file of them.

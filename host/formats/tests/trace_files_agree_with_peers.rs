@@ -10,9 +10,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use cantap_formats::{CsvDialect, Format, TrcVersion};
+use cantap_formats::{CsvDialect, Format, ReadOptions, TrcVersion, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
-use traces::{directory, file_name, frames, odd, read, real, write};
+use traces::{directory, file_name, frames, odd, read, real, split, write};
 
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
 
@@ -153,6 +153,7 @@ fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
         (Format::Candump, Carries { events: Events::All, ..EVERYTHING }),
         (Format::Asc, EVERYTHING),
         (Format::Blf, EVERYTHING),
+        (Format::Mf4, EVERYTHING),
         (
             Format::Csv(CsvDialect::PythonCan),
             Carries { channel: Some(0), direction: false, events: Events::All, ..EVERYTHING },
@@ -199,6 +200,8 @@ fn we_read_every_message_of_the_files_that_python_can_writes() {
         ("a.blf", EVERYTHING),
         ("a.csv", table),
         ("a.trc", EVERYTHING),
+        ("a.mf4", EVERYTHING),
+        ("a.txt", EVERYTHING),
         ("a.log.gz", log),
     ];
     let paths: Vec<_> = cases.iter().map(|(name, _)| directory.join(name)).collect();
@@ -301,6 +304,13 @@ fn can_utils_and_we_read_each_others_logs_and_asc_files() {
     log2long.stdin(fs::File::open(at("every.log")).unwrap());
     let text = run("log2long (can-utils)", &[], &mut log2long).unwrap();
     assert_eq!(text.lines().filter(|line| line.starts_with('(')).count(), every.len(), "{text}");
+    // It prints as candump does.
+    fs::write(at("screen.txt"), &text).unwrap();
+    let options = ReadOptions { format: Some(Format::CandumpScreen), ..ReadOptions::default() };
+    let (screen, issues) = split(open_reader(at("screen.txt"), &options).unwrap());
+    assert_eq!(issues, Vec::<String>::new());
+    let shown = Carries { direction: false, events: Events::All, ..EVERYTHING };
+    assert_eq!(lines(&screen, shown), lines(&every, shown));
     let errors = every.iter().filter(|record| record.frame().is_none()).count();
     assert_eq!(text.matches("ERRORFRAME").count(), errors, "{text}");
     for name in ["theirs.asc", "theirs.log"] {

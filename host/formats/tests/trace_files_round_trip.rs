@@ -16,23 +16,27 @@ fn resolution_ns(format: Format) -> i64 {
         Format::Trc(TrcVersion::V1_0) => 1_000_000,
         Format::Trc(TrcVersion::V1_1) => 100_000,
         Format::Candump | Format::Asc | Format::Trc(_) => 1000,
-        Format::Blf | Format::Csv(_) | Format::Pcapng | Format::Dif => 1,
+        Format::Blf | Format::Csv(_) | Format::Pcapng | Format::Dif | Format::Mf4 => 1,
         new => panic!("{new} has no resolution here yet"),
     }
 }
 
 /// Whether records or parts of them are missing from a file, which the number of its rows is not.
 fn lacks_records(left_out: &LeftOut) -> bool {
-    left_out.iter().any(|(what, _)| !what.starts_with("the number of rows"))
+    left_out.iter().any(|(what, _)| {
+        !what.starts_with("the number of rows") && !what.starts_with("the numbers of records")
+    })
 }
 
 #[test]
 fn a_number_of_rows_that_cannot_be_written_afterwards_is_named() {
     let directory = directory("totals");
-    for (name, named) in [("a.dif", 0), ("a.dif.gz", 1), ("a.blf", 0), ("a.blf.zst", 0), ("a.log.gz", 0)] {
+    for (name, named) in
+        [("a.dif", 0), ("a.dif.gz", 1), ("a.blf", 0), ("a.blf.zst", 0), ("a.mf4", 0), ("a.mf4.xz", 1)]
+    {
         let path = directory.join(name);
         let left_out = write(&path, Format::of_path(&path).unwrap(), &real(10));
-        let counts = left_out.iter().filter(|(what, _)| what.starts_with("the number of rows")).count();
+        let counts = left_out.iter().filter(|(what, _)| what.starts_with("the number")).count();
         assert_eq!(counts, named, "{name}: {left_out:?}");
     }
 }
@@ -42,8 +46,8 @@ fn real_traffic_survives_every_format_plain_and_compressed() {
     let directory = directory("real_traffic");
     let written = real(usize::MAX);
     assert_eq!(written.len(), 10_495, "frames in the real file");
-    for format in Format::all() {
-        for compression in ["", ".gz", ".zst"] {
+    for format in Format::written() {
+        for compression in ["", ".gz", ".zst", ".xz", ".lz4"] {
             let path = directory.join(file_name(format, compression));
             let left_out = write(&path, format, &written);
             let (records, issues) = read(&path);
@@ -70,7 +74,7 @@ proptest! {
         compression in prop::sample::select(vec!["", ".gz", ".zst"]),
     ) {
         let directory = tempfile::tempdir().unwrap();
-        for format in Format::all() {
+        for format in Format::written() {
             let path = directory.path().join(file_name(format, compression));
             let left_out = write(&path, format, &records);
             let (read, issues) = read(&path);
@@ -85,7 +89,7 @@ proptest! {
         records in prop::collection::vec(testing::record(1), 0..16),
     ) {
         let directory = tempfile::tempdir().unwrap();
-        for format in Format::all() {
+        for format in Format::written() {
             let path = directory.path().join(file_name(format, ""));
             write(&path, format, &records);
             let (once, _) = read(&path);
@@ -110,7 +114,7 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table() {
     assert!(write(&path, Format::Csv(CsvDialect::Full), &records).is_empty());
     assert_eq!(read(&path), (records.to_vec(), Vec::new()));
     // The others say what they leave out.
-    for format in Format::all().filter(|format| *format != Format::Csv(CsvDialect::Full)) {
+    for format in Format::written().filter(|format| *format != Format::Csv(CsvDialect::Full)) {
         let left_out = write(&directory.join(file_name(format, "")), format, &records);
         let late: Vec<_> = left_out.iter().filter(|(what, _)| what.contains("upper bounds")).collect();
         assert!(matches!(late[..], [(_, 3)]), "{format}: {left_out:?}");

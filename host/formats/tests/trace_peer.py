@@ -19,8 +19,8 @@ def channel_from_1(message, suffix):
         return 0
     if isinstance(channel, str):
         return int("".join(filter(str.isdigit, channel)) or 0) + 1
-    # The reader of PEAK's files hands the bus number on, the others count from 0.
-    return channel if suffix == ".trc" else channel + 1
+    # The readers of PEAK's files and of MF4 hand the bus number on, the others count from 0.
+    return channel if suffix in (".trc", ".mf4") else channel + 1
 
 
 def line(message, suffix):
@@ -77,12 +77,13 @@ def write(lines, paths):
             )
         )
     for path in paths:
-        # Only the candump log names interfaces.
-        named = suffix_of(path) == ".log"
+        # Only the candump log and what is printed name interfaces; MF4 counts from 1.
+        named = suffix_of(path) in (".log", ".txt")
+        first = 1 if suffix_of(path) == ".mf4" else 0
         with can.Logger(path) as logger:
             for message in messages:
                 number = message.channel
-                message.channel = f"can{number}" if named else number
+                message.channel = f"can{number}" if named else number + first
                 logger.on_message_received(message)
                 message.channel = number
 

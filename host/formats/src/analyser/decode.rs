@@ -6,6 +6,7 @@ use super::super::calendar::Date;
 use super::super::found::Row as ReadRow;
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
 use super::{COLUMNS, ERRORS};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
@@ -14,11 +15,18 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 pub(crate) struct RowDecoder {
     separator: u8,
     start_ns: i64,
+    /// Of the date in a comment.
+    zone: Zone,
     /// The place of each of [`COLUMNS`] in this file.
     places: Vec<Option<usize>>,
 }
 
 impl RowDecoder {
+    /// With the zone of the file's date.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { zone: zone.clone(), ..Self::default() }
+    }
+
     /// Looks at a line of CSV before the rows. True if it names the columns; a comment may name the date.
     pub(crate) fn head(&mut self, line: &[u8]) -> bool {
         if let Some([separator, ..]) = line.strip_prefix(b"Index") {
@@ -36,7 +44,7 @@ impl RowDecoder {
         let digits = |c: char| !(c.is_ascii_digit() || ":.-/ ".contains(c));
         for part in comment.split(digits) {
             if let Some(start_ns) = date(part.trim_matches(|c: char| !c.is_ascii_digit())) {
-                self.start_ns = start_ns;
+                self.start_ns = self.zone.utc_ns(start_ns);
             }
         }
     }

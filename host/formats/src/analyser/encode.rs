@@ -8,6 +8,7 @@ use super::super::codec::Encode;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
 use super::ERRORS;
 use cantap_trace::bits::FrameBits;
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
@@ -183,16 +184,20 @@ pub(crate) struct TableEncoder<L> {
     layout: L,
     rows: RowEncoder,
     started: bool,
+    /// Of the date.
+    zone: Zone,
 }
 
 impl<L: Layout> TableEncoder<L> {
-    pub(crate) fn new(layout: L) -> Self {
-        Self { layout, rows: RowEncoder::default(), started: false }
+    /// With the zone of the file's date.
+    pub(crate) fn new(layout: L, zone: &Zone) -> Self {
+        Self { layout, rows: RowEncoder::default(), started: false, zone: zone.clone() }
     }
 
     fn start(&mut self, first_ns: i64, out: &mut Vec<u8>) {
         if !std::mem::replace(&mut self.started, true) {
-            self.layout.head(&date_comment(self.rows.start(first_ns)), out);
+            let clock_ns = self.zone.clock_ns(self.rows.start(first_ns));
+            self.layout.head(&date_comment(clock_ns), out);
         }
     }
 }

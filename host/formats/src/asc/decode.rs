@@ -12,6 +12,7 @@ use super::super::input::Input;
 use super::super::issue::Fault;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
 use super::{FD_FORMAT, REMOTE, STATES};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -28,6 +29,8 @@ pub(crate) struct Decoder {
     blocks: u32,
     /// What times are added to: a date, or with relative times the last event.
     base_ns: Option<i64>,
+    /// Of the dates.
+    zone: Zone,
 }
 
 /// What a line is.
@@ -56,6 +59,13 @@ fn is_footer(line: &[u8]) -> bool {
     line.is_empty() || begins(line, "end triggerblock")
 }
 
+impl Decoder {
+    /// With the zone of the file's dates.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { zone: zone.clone(), ..Self::default() }
+    }
+}
+
 impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         while let Some(line) = input.line()? {
@@ -79,7 +89,7 @@ impl Decode for Decoder {
 impl Decoder {
     fn line(&mut self, line: &[u8]) -> Result<Content, Fault> {
         let (time, rest) = text::word(line);
-        match text::time(time, NS_PER_S, b'.') {
+        match text::time_of_any_mark(time, NS_PER_S) {
             Some(offset_ns) => self.event(offset_ns, rest),
             None => self.head(line).map(|()| Content::Other),
         }
@@ -88,7 +98,7 @@ impl Decoder {
     /// A line that does not begin with a time.
     fn head(&mut self, line: &[u8]) -> Result<(), Fault> {
         if begins(line, "date ") {
-            self.date_ns = date(&line[5..])?;
+            self.date_ns = self.zone.utc_ns(date(&line[5..])?);
         } else if begins(line, "base ") {
             let words = line.to_ascii_lowercase();
             let has = |word| memchr::memmem::find(&words, word).is_some();
@@ -99,7 +109,7 @@ impl Decoder {
             self.blocks += 1;
             let stamp = line["begin triggerblock".len()..].trim_ascii();
             if self.blocks == 1 && !stamp.is_empty() {
-                self.block_ns = Some(date(stamp)?);
+                self.block_ns = Some(self.zone.utc_ns(date(stamp)?));
             }
         } else if !(line.is_empty()
             || line.starts_with(b"//")
@@ -389,7 +399,7 @@ fn date(text: &[u8]) -> Result<i64, Fault> {
     let mut part = || parts.next().map(str::as_bytes).ok_or_else(fault);
     let hour = text::decimal(part()?).ok_or_else(fault)?;
     let minute = text::decimal(part()?).ok_or_else(fault)?;
-    let second_ns = text::time(part()?, NS_PER_S, b'.').filter(|ns| *ns >= 0).ok_or_else(fault)?;
+    let second_ns = text::time_of_any_mark(part()?, NS_PER_S).filter(|ns| *ns >= 0).ok_or_else(fault)?;
     let hour = match half.map(str::to_ascii_lowercase).as_deref() {
         // Twelve comes first on a clock of twelve hours. Some files write hours above twelve and pm.
         Some("am") => hour % 12,

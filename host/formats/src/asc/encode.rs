@@ -9,6 +9,7 @@ use super::super::left_out::LeftOut;
 use super::super::line::{Line, Seconds};
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
+use super::super::zone::Zone;
 use super::{FD_FORMAT, PASSIVE_SENDER, STATES, SWITCHED_BIT_RATE};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -17,11 +18,14 @@ pub(crate) struct Encoder {
     /// The time that the file's times count from; known with the first record.
     start_ns: Option<i64>,
     seconds: Seconds<SECONDS_WIDTH>,
+    /// Of the dates.
+    zone: Zone,
 }
 
-impl Default for Encoder {
-    fn default() -> Self {
-        Self { start_ns: None, seconds: Seconds::new() }
+impl Encoder {
+    /// With the zone of the file's dates.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { start_ns: None, seconds: Seconds::new(), zone: zone.clone() }
     }
 }
 
@@ -52,9 +56,10 @@ impl Encoder {
         let start_ns = start_of_trace(first_ns);
         self.start_ns = Some(start_ns);
         out.extend_from_slice(b"date ");
-        push_date(out, start_ns);
+        let clock_ns = self.zone.clock_ns(start_ns);
+        push_date(out, clock_ns);
         out.extend_from_slice(b"base hex  timestamps absolute\ninternal events logged\nBegin Triggerblock ");
-        push_date(out, start_ns);
+        push_date(out, clock_ns);
         out.extend_from_slice(b"   0.000000 Start of measurement\n");
         start_ns
     }

@@ -13,6 +13,7 @@ use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
 use super::super::sja1000;
+use super::super::zone::Zone;
 use super::kinds::{group, is_bookkeeping};
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR, CAN_ERROR_EXT, CAN_FD_ERROR_64, CAN_FD_MESSAGE, CAN_FD_MESSAGE_64,
@@ -39,6 +40,8 @@ pub(crate) const KINDS: [BusErrorKind; 6] = [
 pub(crate) struct Decoder {
     started: bool,
     start_ns: i64,
+    /// Of the dates in the header.
+    zone: Zone,
     /// How long the header says that the file is.
     file_bytes: u64,
     /// Decompressed objects; those before `at` are used up. One may go on in the next container.
@@ -56,6 +59,7 @@ pub(crate) struct Decoder {
 impl Default for Decoder {
     fn default() -> Self {
         Self {
+            zone: Zone::default(),
             started: false,
             start_ns: 0,
             file_bytes: 0,
@@ -105,6 +109,13 @@ enum Object {
     Issue(Fault),
     /// The rest is in the next container, if there is one.
     Incomplete,
+}
+
+impl Decoder {
+    /// With the zone of the file's dates.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { zone: zone.clone(), ..Self::default() }
+    }
 }
 
 impl Decode for Decoder {
@@ -160,7 +171,7 @@ impl Decoder {
         let len = u32_at(head, 4) as usize;
         // A cut is told once.
         self.file_bytes = if cut { 0 } else { u64_at(head, FILE_BYTES_OFFSET) };
-        self.start_ns = system_time(&head[START_OFFSET.min(head.len())..]);
+        self.start_ns = self.zone.utc_ns(system_time(&head[START_OFFSET.min(head.len())..]));
         input.consume(if (START_OFFSET..=4096).contains(&len) { len } else { FILE_HEADER_BYTES });
         Ok(cut.then_some(Fault::Truncated("the file header")))
     }

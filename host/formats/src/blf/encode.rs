@@ -8,6 +8,7 @@ use super::super::event_text;
 use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::sja1000;
+use super::super::zone::Zone;
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR_EXT, CAN_FD_MESSAGE, CAN_MESSAGE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
     DATA_LOST_END, EVENT_COMMENT, EXTENDED, FD_FORMAT, FD_PASSIVE_SENDER, FD_SWITCHED_BIT_RATE,
@@ -33,6 +34,8 @@ pub(crate) struct Encoder {
     object_count: u32,
     /// Length of the file if nothing were compressed.
     uncompressed_bytes: u64,
+    /// Of the dates in the header.
+    zone: Zone,
 }
 
 impl Default for Encoder {
@@ -45,11 +48,19 @@ impl Default for Encoder {
             compressor: Compress::new(Compression::new(LEVEL), true),
             object_count: 0,
             uncompressed_bytes: FILE_HEADER_BYTES as u64,
+            zone: Zone::default(),
         }
     }
 }
 
-/// A Windows SYSTEMTIME in UTC; zeros where the trace has no date.
+impl Encoder {
+    /// With the zone of the file's dates.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { zone: zone.clone(), ..Self::default() }
+    }
+}
+
+/// A Windows SYSTEMTIME; zeros where the trace has no date.
 fn push_system_time(out: &mut Vec<u8>, time_ns: i64) {
     if (0..FIRST_DATE_NS).contains(&time_ns) {
         out.extend_from_slice(&[0; 16]);
@@ -82,8 +93,8 @@ impl Encoder {
         header.extend_from_slice(&self.uncompressed_bytes.to_le_bytes());
         header.extend_from_slice(&self.object_count.to_le_bytes());
         header.extend_from_slice(&0_u32.to_le_bytes());
-        push_system_time(&mut header, self.start_ns);
-        push_system_time(&mut header, self.stop_ns);
+        push_system_time(&mut header, self.zone.clock_ns(self.start_ns));
+        push_system_time(&mut header, self.zone.clock_ns(self.stop_ns));
         header.resize(FILE_HEADER_BYTES, 0);
         header
     }

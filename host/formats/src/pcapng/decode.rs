@@ -2,23 +2,18 @@
 
 use std::io;
 
-use cantap_wire::{Frame, Id};
-
 use super::super::codec::Decode;
-use super::super::error_frames::ErrorFrames;
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::interfaces::Interfaces;
 use super::super::issue::{Fault, Place};
+use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, EXTENDED,
-    IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LINK_TYPE, OBSOLETE_PACKET, OUTBOUND, REMOTE,
-    SECTION_HEADER, SIMPLE_PACKET,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, IF_NAME,
+    IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, OBSOLETE_PACKET, OUTBOUND, SECTION_HEADER, SIMPLE_PACKET,
 };
-use cantap_trace::fd::{FLAG_BRS, FLAG_ESI};
-use cantap_trace::socketcan::ERROR_FLAG;
-use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// Longest block of a trace; far above what a CAN packet takes.
 const MAX_BLOCK_BYTES: usize = MAX_ITEM_BYTES;
@@ -32,13 +27,16 @@ pub(crate) struct Decoder {
     started: bool,
     interfaces: Vec<Interface>,
     names: Interfaces,
-    error_frames: ErrorFrames,
+    /// Of captures of any interface: those that the packets name.
+    cooked: Interfaces,
+    packets: Packets,
 }
 
 /// What an interface description says.
 #[derive(Clone, Copy)]
 struct Interface {
-    link_type: u16,
+    /// `None` for what does not carry CAN.
+    link: Option<Link>,
     channel: u8,
     /// Units per second.
     resolution: u64,
@@ -91,7 +89,7 @@ impl Decode for Decoder {
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
-        if let Some(found) = self.error_frames.next() {
+        if let Some(found) = self.packets.errors.next() {
             return Ok(found);
         }
         loop {
@@ -132,7 +130,7 @@ impl Decode for Decoder {
                     let result = self.block(kind, fields);
                     input.consume(len);
                     match result {
-                        Ok(Some(record)) => return Ok(Found::Record(record)),
+                        Ok(Some(found)) => return Ok(found),
                         Ok(None) => continue,
                         Err(fault) => return Ok(Found::Issue(place, fault)),
                     }
@@ -198,7 +196,7 @@ impl Decoder {
     }
 
     #[inline]
-    fn block(&mut self, kind: u32, fields: Fields) -> Result<Option<TraceRecord>, Fault> {
+    fn block(&mut self, kind: u32, fields: Fields) -> Result<Option<Found>, Fault> {
         let short = || Fault::malformed("a longer block", format!("{} bytes", fields.bytes.len()).as_bytes());
         match kind {
             SECTION_HEADER => {
@@ -223,11 +221,8 @@ impl Decoder {
                 let interface = known.ok_or_else(|| {
                     Fault::malformed("a described interface", interface.to_string().as_bytes())
                 })?;
-                if interface.link_type != LINK_TYPE {
-                    return Err(Fault::Unsupported("a packet that is not SocketCAN".into()));
-                }
                 let time_ns = interface.time_ns(u64::from(high) << 32 | u64::from(low));
-                self.packet(interface.channel, time_ns, packet, fields, options).map(Some)
+                self.packet(interface, time_ns, packet, fields, options).map(Some)
             }
             // It has no time.
             SIMPLE_PACKET => Err(Fault::Unsupported("a packet without a time".into())),
@@ -256,22 +251,24 @@ impl Decoder {
             }
         }
         let channel = self.names.channel(&name);
-        self.interfaces.push(Interface { link_type, channel, resolution, offset_s });
+        let link = Link::of(u32::from(link_type), self.big_endian);
+        self.interfaces.push(Interface { link, channel, resolution, offset_s });
         Some(())
     }
 
-    /// A SocketCAN packet.
+    /// A packet and its options.
     #[inline]
     fn packet(
         &mut self,
-        channel: u8,
+        interface: Interface,
         time_ns: i64,
         packet: &[u8],
         fields: Fields,
         options: usize,
-    ) -> Result<TraceRecord, Fault> {
-        const FD_FORMAT: u8 = 0x04;
-        const XL_FORMAT: u8 = 0x80;
+    ) -> Result<Found, Fault> {
+        let Some(link) = interface.link else {
+            return Ok(Found::LeftOut("packets that are not SocketCAN"));
+        };
         let (mut flags, mut dropped) = (0, 0);
         for (code, value) in fields.options(options) {
             match code {
@@ -280,88 +277,41 @@ impl Decoder {
                 _ => {}
             }
         }
+        let named = link.interface(packet).map(|number| format!("interface {number}: "));
+        let channel = named.map_or(interface.channel, |name| self.cooked.channel(name.as_bytes()));
         let record = |event| TraceRecord { time_ns, channel, event };
         let count = u32::try_from(dropped).unwrap_or(u32::MAX);
         let lost = record(TraceEvent::Lost { stage: None, count, at_least: u64::from(count) < dropped });
-        let event = match packet {
-            _ if packet.len() < 8 => {
-                let found = format!("{} bytes", packet.len());
-                Err(Fault::malformed("a SocketCAN packet of at least 8 bytes", found.as_bytes()))
-            }
-            [_, _, _, _, len, ..] if len & XL_FORMAT != 0 => Err(Fault::Unsupported("a CAN XL frame".into())),
-            [_, _, _, _, len, kind, ..] if kind & FD_FORMAT != 0 || *len > 8 => {
-                flexible(packet, flags).map(|event| (event, None))
-            }
-            _ => event(packet, flags, &mut self.error_frames),
-        };
-        match event {
-            Ok((event, second)) => {
+        match self.packets.read(link, packet, direction(flags)) {
+            Ok(Packet::Events(event, second)) => {
                 // Our own error frame for a loss has the same count, and says more.
                 if dropped > 0 && !matches!(event, TraceEvent::Lost { .. }) {
-                    self.error_frames.keep([event].into_iter().chain(second).map(record));
-                    return Ok(lost);
+                    self.packets.errors.keep([event].into_iter().chain(second).map(record));
+                    return Ok(Found::Record(lost));
                 }
-                self.error_frames.keep(second.map(record));
-                Ok(record(event))
+                self.packets.errors.keep(second.map(record));
+                Ok(Found::Record(record(event)))
+            }
+            Ok(Packet::LeftOut(what)) => {
+                self.packets.errors.keep((dropped > 0).then_some(lost));
+                Ok(Found::LeftOut(what))
             }
             Err(fault) => {
-                if dropped > 0 {
-                    self.error_frames.keep([lost]);
-                }
+                self.packets.errors.keep((dropped > 0).then_some(lost));
                 Err(fault)
             }
         }
     }
 }
 
-/// A packet's identifier, without its flags.
-fn identifier(id: u32) -> Result<Id, Fault> {
-    let raw = id & !(EXTENDED | REMOTE);
-    let parsed = if id & EXTENDED != 0 { Id::extended(raw) } else { Id::standard(raw) };
-    parsed.ok_or_else(|| Fault::malformed("an identifier up to 0x7ff", format!("{raw:#x}").as_bytes()))
-}
-
 /// What the flags of a packet's block say of its direction.
-fn direction(flags: u32) -> Direction {
-    if flags & DIRECTION == OUTBOUND { Direction::Tx } else { Direction::Rx }
-}
-
-/// A CAN FD packet.
-fn flexible(packet: &[u8], flags: u32) -> Result<TraceEvent, Fault> {
-    let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
-    let (len, kind) = (packet[4], packet[5]);
-    let data = packet[8..].get(..usize::from(len)).ok_or_else(|| {
-        Fault::malformed(format!("{len} data bytes"), (packet.len() - 8).to_string().as_bytes())
-    })?;
-    let frame = FdFrame::new(identifier(id)?, kind & FLAG_BRS != 0, kind & FLAG_ESI != 0, data);
-    let frame = frame
-        .ok_or_else(|| Fault::malformed("a length that CAN FD has", format!("{len} bytes").as_bytes()))?;
-    Ok(TraceEvent::Frame { frame: frame.into(), direction: direction(flags), late: false })
-}
-
-/// What a classical packet says.
-#[inline]
-fn event(
-    packet: &[u8],
-    flags: u32,
-    error_frames: &mut ErrorFrames,
-) -> Result<(TraceEvent, Option<TraceEvent>), Fault> {
-    let id = u32::from_be_bytes([packet[0], packet[1], packet[2], packet[3]]);
-    let (len, raw_dlc) = (packet[4], packet[7]);
-    let mut data = [0; 8];
-    let present = packet[8..].len().min(usize::from(len)).min(8);
-    data[..present].copy_from_slice(&packet[8..8 + present]);
-    if id & ERROR_FLAG != 0 {
-        return Ok(error_frames.read(id, data));
+fn direction(flags: u32) -> Option<Direction> {
+    const INBOUND: u32 = 1;
+    match flags & DIRECTION {
+        OUTBOUND => Some(Direction::Tx),
+        INBOUND => Some(Direction::Rx),
+        _ => None,
     }
-    let remote = id & REMOTE != 0;
-    if present < usize::from(len) && !remote {
-        return Err(Fault::malformed(format!("{len} data bytes"), format!("{present}").as_bytes()));
-    }
-    let parsed = identifier(id)?;
-    let dlc = if len == 8 && (9..=15).contains(&raw_dlc) { raw_dlc } else { len };
-    let frame = Frame::from_bus(parsed, remote, dlc, data);
-    Ok((TraceEvent::Frame { frame: frame.into(), direction: direction(flags), late: false }, None))
 }
 
 impl Interface {

@@ -12,6 +12,7 @@ use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::Fault;
 use super::super::text;
+use super::super::zone::Zone;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_of, event_of};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -29,6 +30,8 @@ pub(crate) struct Decoder {
     layout: Layout,
     /// The row before told an event exactly; a row of the format's own for it follows.
     told: Option<TraceRecord>,
+    /// Of the dates.
+    zone: Zone,
 }
 
 /// Which column has what, counted from 0.
@@ -85,7 +88,21 @@ impl Layout {
 impl Default for Decoder {
     fn default() -> Self {
         let version = TrcVersion::V1_0;
-        Self { version, start_ns: 0, has_start: false, layout: Layout::of(version), told: None }
+        Self {
+            version,
+            start_ns: 0,
+            has_start: false,
+            layout: Layout::of(version),
+            told: None,
+            zone: Zone::default(),
+        }
+    }
+}
+
+impl Decoder {
+    /// With the zone of the file's dates.
+    pub(crate) fn new(zone: &Zone) -> Self {
+        Self { zone: zone.clone(), ..Self::default() }
     }
 }
 
@@ -138,8 +155,9 @@ impl Decoder {
             };
             self.layout = Layout::of(self.version);
         } else if let Some(days) = value(b"$STARTTIME=") {
-            self.start_ns = time_of_days(days)
+            let start_ns = time_of_days(days)
                 .ok_or_else(|| Fault::malformed("days since 1899-12-30, such as 44548.6028595139", days))?;
+            self.start_ns = self.zone.utc_ns(start_ns);
             self.has_start = true;
         } else if let Some(names) = value(b"$COLUMNS=") {
             self.layout = Layout::named(names)
@@ -148,7 +166,7 @@ impl Decoder {
             && !self.has_start
             && let Some(start_ns) = date(start.trim_ascii())
         {
-            self.start_ns = start_ns;
+            self.start_ns = self.zone.utc_ns(start_ns);
         }
         Ok(())
     }
@@ -162,7 +180,7 @@ impl Decoder {
         let told = self.told.take();
         let layout = self.layout;
         let time = columns[layout.offset];
-        let offset_ns = text::time(time, NS_PER_MS, b'.')
+        let offset_ns = text::time_of_any_mark(time, NS_PER_MS)
             .ok_or_else(|| Fault::malformed("a time in milliseconds", time))?;
         let time_ns = self.start_ns.saturating_add(offset_ns);
         let kind = layout.kind.map_or(&b""[..], |at| columns[at]);
@@ -338,7 +356,7 @@ fn time_of_days(days: &[u8]) -> Option<i64> {
     const NS_PER_US: i128 = 1000;
     // Decimal digits of a day, exactly: a float would be wrong by half a microsecond.
     const DIGITS: u32 = 18;
-    let (whole, fraction) = match days.iter().position(|byte| *byte == b'.') {
+    let (whole, fraction) = match days.iter().position(|byte| matches!(byte, b'.' | b',')) {
         Some(at) => (&days[..at], &days[at + 1..]),
         None => (days, &b""[..]),
     };
@@ -365,7 +383,7 @@ fn date(text: &[u8]) -> Option<i64> {
     let minute = text::decimal(clock.next()?.as_bytes())?;
     // Tenths of a millisecond follow behind a second point.
     let second: String = clock.next()?.splitn(3, '.').take(2).collect::<Vec<_>>().join(".");
-    let second_ns = text::time(second.as_bytes(), text::NS_PER_S, b'.').filter(|ns| *ns >= 0)?;
+    let second_ns = text::time_of_any_mark(second.as_bytes(), text::NS_PER_S).filter(|ns| *ns >= 0)?;
     let second = (second_ns / text::NS_PER_S) as u64;
     let of_day_ns = Date::of_day(hour, minute, second, second_ns % text::NS_PER_S)?;
     Date { year: i64::from(year), month: u8::try_from(month).ok()?, day: u8::try_from(day).ok()?, of_day_ns }

@@ -5,6 +5,7 @@ use super::super::codec::Encode;
 use super::super::event_text;
 use super::super::left_out::LeftOut;
 use super::super::text;
+use super::super::zone::Zone;
 use super::{EPOCH_DAY, TrcVersion, WARNING_ID, error_code, status_of};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -18,6 +19,8 @@ pub(crate) struct Encoder {
     start_ns: Option<i64>,
     /// Rows so far.
     rows: u64,
+    /// Of the date.
+    zone: Zone,
 }
 
 /// Rows that every version's head ends with, without the leading `;`: the columns' names.
@@ -96,14 +99,16 @@ fn days(time_ns: i64) -> String {
 }
 
 impl Encoder {
-    pub(crate) fn new(version: TrcVersion) -> Self {
-        Self { version, start_ns: None, rows: 0 }
+    /// With the zone of the file's date.
+    pub(crate) fn new(version: TrcVersion, zone: &Zone) -> Self {
+        Self { version, start_ns: None, rows: 0, zone: zone.clone() }
     }
 
     fn head(&mut self, first_ns: i64, out: &mut Vec<u8>) -> i64 {
         let start_ns = start_of_trace(first_ns);
         self.start_ns = Some(start_ns);
-        let date = Date::of(start_ns);
+        let clock_ns = self.zone.clock_ns(start_ns);
+        let date = Date::of(clock_ns);
         let (hour, minute, second, ns) = date.clock();
         let (day, month, year, ms) = (date.day, date.month, date.year, ns / 1_000_000);
         let start = format!("{day:02}.{month:02}.{year:04} {hour:02}:{minute:02}:{second:02}.{ms:03}");
@@ -119,7 +124,7 @@ impl Encoder {
             ]);
         } else {
             lines.push(format!("$FILEVERSION={}", self.version.name()));
-            lines.push(format!("$STARTTIME={}", days(start_ns)));
+            lines.push(format!("$STARTTIME={}", days(clock_ns)));
             match self.version {
                 TrcVersion::V2_0 => lines.push("$COLUMNS=N,O,T,I,d,l,D".to_owned()),
                 TrcVersion::V2_1 => lines.push("$COLUMNS=N,O,T,B,I,d,R,L,D".to_owned()),

@@ -28,13 +28,18 @@ pub const ODD: &str = "(1410714882.000000) can0 000#\n\
 /// A format's file name, so that reading finds the format without being told.
 pub fn file_name(format: Format, compression: &str) -> String {
     let suffix = match format {
-        Format::Candump => "log",
+        Format::Candump | Format::Busmaster => "log",
         Format::Asc => "asc",
         Format::Blf => "blf",
-        Format::Trc(_) => "trc",
+        Format::Trc(_) | Format::CanHacker => "trc",
         Format::Csv(_) => "csv",
         Format::Pcapng => "pcapng",
         Format::Dif => "dif",
+        Format::Mf4 => "mf4",
+        Format::Pcap => "pcap",
+        Format::CandumpScreen | Format::Kvaser | Format::Printer => "txt",
+        Format::Crtd => "crtd",
+        Format::Microchip => "can",
         new => panic!("{new} has no suffix here yet"),
     };
     format!("{format}.{suffix}{compression}")

@@ -1,0 +1,24 @@
+//! Any text as one of the logs of other programs: the first byte says which.
+
+#![no_main]
+
+mod trace;
+
+use cantap_formats::{CsvDialect, Format};
+
+const FORMATS: [Format; 8] = [
+    Format::Csv(CsvDialect::Gvret),
+    Format::CandumpScreen,
+    Format::Busmaster,
+    Format::Crtd,
+    Format::Kvaser,
+    Format::Microchip,
+    Format::CanHacker,
+    Format::Printer,
+];
+
+libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {
+    if let Some((first, rest)) = bytes.split_first() {
+        trace::read(FORMATS[usize::from(*first) % FORMATS.len()], rest);
+    }
+});

@@ -1,0 +1,270 @@
+//! What candump shows on a screen: `(time)  can0  123   [8]  11 22 33 44 55 66 77 88   '.."3DUfw'`, with any of its options
+//! for times (`-t a`, `-t d`, `-t z`, `-t A`), `-x` and `-a`, with colours or without.
+
+use super::date_time_ns;
+use super::error_frames::ErrorFrames;
+use super::frame_fields::{FdFields, FrameFields, Payload, hex_byte, identifier};
+use super::interfaces::Interfaces;
+use super::issue::Fault;
+use super::row_format::{Line, RowFormat};
+use super::text::{self, NS_PER_S};
+use super::zone::Zone;
+use cantap_trace::socketcan::ERROR_FLAG;
+use cantap_trace::{Direction, TraceRecord};
+
+const NO_TIMES: &str = "frames have no time: candump shows one with -t a";
+const DIFFERENCES: &str = "times are added up: candump showed the differences from frame to frame (-t d)";
+
+/// Reads candump's screen output.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    interfaces: Interfaces,
+    errors: ErrorFrames,
+    /// Whether times are differences.
+    differences: bool,
+    last_ns: i64,
+    /// What is to be told of the last line.
+    note: Option<&'static str>,
+}
+
+/// Whether a line is one of these.
+pub(crate) fn is_line(line: &[u8]) -> bool {
+    let line = plain(line);
+    let Some((_, rest)) = stamp(&line) else { return false };
+    let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+    let _interface = words.next();
+    // Behind the interface and the columns of -x: the identifier, then the length.
+    let mut before = words.next().unwrap_or_default();
+    for word in words.take(4) {
+        if length(word).is_some() {
+            return [3, 8].contains(&before.len()) && text::hex(before).is_some();
+        }
+        before = word;
+    }
+    false
+}
+
+/// `[8]` for a classical frame, `[08]` for one of CAN FD, `{F}` for a code of more than the eight bytes.
+fn length(word: &[u8]) -> Option<(u8, bool)> {
+    match word {
+        [b'[', digit @ b'0'..=b'8', b']'] => Some((digit - b'0', false)),
+        [b'{', digit, b'}'] => text::hex_digit(*digit).filter(|code| *code > 8).map(|code| (code, false)),
+        [b'[', tens, ones, b']'] => {
+            let len = text::decimal(&[*tens, *ones]).filter(|len| *len <= 64)?;
+            Some((len as u8, true))
+        }
+        _ => None,
+    }
+}
+
+/// A line without the sequences that colour it.
+fn plain(line: &[u8]) -> std::borrow::Cow<'_, [u8]> {
+    const ESCAPE: u8 = 0x1B;
+    if !line.contains(&ESCAPE) {
+        return line.into();
+    }
+    let (mut out, mut within) = (Vec::with_capacity(line.len()), false);
+    for byte in line {
+        match byte {
+            &ESCAPE => within = true,
+            b'm' if within => within = false,
+            _ if within => {}
+            other => out.push(*other),
+        }
+    }
+    out.into()
+}
+
+/// The time in parentheses in front of a line, empty if there is none, and what follows it.
+fn stamp(line: &[u8]) -> Option<(&[u8], &[u8])> {
+    let line = line.trim_ascii();
+    match line.strip_prefix(b"(") {
+        None => Some((b"", line)),
+        Some(rest) => {
+            let end = memchr::memchr(b')', rest)?;
+            Some((rest[..end].trim_ascii(), &rest[end + 1..]))
+        }
+    }
+}
+
+/// Whether times that begin at about zero are differences. As times from the start they would not go back, and no two frames
+/// of a bus have the same one.
+fn are_differences(times: &[i64]) -> bool {
+    let pairs = || times.windows(2).map(|pair| (pair[0], pair[1]));
+    let same = pairs().filter(|(before, after)| before == after && *after > 0).count();
+    pairs().any(|(before, after)| after < before) || 2 * same > times.len().saturating_sub(1)
+}
+
+impl RowFormat for Decoder {
+    fn begin(&mut self, buffered: &[u8]) {
+        const ENOUGH: usize = 1000;
+        let time = |line: &[u8]| {
+            let line = plain(line);
+            let (time, _) = stamp(&line)?;
+            text::time(time, NS_PER_S, b'.')
+        };
+        let lines = buffered.split(|byte| *byte == b'\n');
+        let times: Vec<i64> = lines.filter_map(time).take(ENOUGH).collect();
+        let from_start = times.first().is_some_and(|first| *first < NS_PER_S);
+        self.differences = from_start && are_differences(&times);
+    }
+
+    fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault> {
+        let line = plain(line);
+        // What an error frame means (-e) stands below it.
+        if line.is_empty() || line.starts_with(b"\t") {
+            return Ok(Line::Nothing);
+        }
+        let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", &line);
+        let (time, rest) = stamp(&line).ok_or_else(missing)?;
+        let row = self.row(&line, time, rest, zone)?;
+        if time.is_empty() {
+            self.note = Some(NO_TIMES);
+        } else if self.differences {
+            self.note = Some(DIFFERENCES);
+        }
+        Ok(row)
+    }
+
+    fn note(&mut self) -> Option<&'static str> {
+        self.note.take().or_else(|| self.errors.note())
+    }
+
+    fn trims(&self) -> bool {
+        false
+    }
+
+    fn may_be_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        // The bytes are as many as the length says.
+        record.frame().is_none_or(cantap_trace::TraceFrame::is_remote) && !line.ends_with(b"remote request")
+    }
+}
+
+impl Decoder {
+    fn row(&mut self, line: &[u8], time: &[u8], rest: &[u8], zone: &Zone) -> Result<Line, Fault> {
+        let missing = || Fault::malformed("a line of candump such as 'can0  123   [2]  11 22'", line);
+        let time_ns = self.time(time, zone)?;
+        let (interface, rest) = text::word(rest);
+        let (mut id, mut rest) = text::word(rest);
+        let (mut direction, mut flags) = (Direction::Rx, FdFields::default());
+        if let b"RX" | b"TX" = id {
+            direction = if id == b"TX" { Direction::Tx } else { Direction::Rx };
+            let (brs, behind) = text::word(rest);
+            let (esi, behind) = text::word(behind);
+            flags = FdFields { brs: brs == b"B", esi: esi == b"E" };
+            (id, rest) = text::word(behind);
+        }
+        let (len, rest) = text::word(rest);
+        let raw = text::hex(id).filter(|_| [3, 8].contains(&id.len())).ok_or_else(missing)?;
+        let (len, is_fd) = length(len).ok_or_else(missing)?;
+        let channel = self.interfaces.channel(interface);
+        let record = |event| TraceRecord { time_ns, channel, event };
+        let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        if id.len() == 8 && raw & ERROR_FLAG != 0 {
+            let data = Payload::words(words, usize::from(len.min(8)), hex_byte)?;
+            let (event, second) = self.errors.read(raw, data.first_eight());
+            return Ok(match second {
+                Some(second) => Line::Two(record(event), second),
+                None => Line::Record(record(event)),
+            });
+        }
+        let remote = rest.trim_ascii().starts_with(b"remote request");
+        let fd = is_fd.then_some(flags);
+        let id = identifier(raw, id.len() == 8, id)?;
+        let fields = FrameFields { id, remote, direction, len, fd };
+        let data = Payload::words(&mut words, fields.data_len(), hex_byte)?;
+        // A byte more is a length less: a digit changed.
+        if !remote && words.next().and_then(hex_byte).is_some() {
+            return Err(Fault::malformed(format!("{len} data bytes"), rest.trim_ascii()));
+        }
+        Ok(Line::Record(record(fields.event(&data)?)))
+    }
+
+    fn time(&mut self, time: &[u8], zone: &Zone) -> Result<i64, Fault> {
+        if time.is_empty() {
+            return Ok(self.last_ns);
+        }
+        let fault =
+            || Fault::malformed("a time such as 1436509052.249713 or 2015-07-10 08:17:32.249713", time);
+        let time_ns = match text::time(time, NS_PER_S, b'.') {
+            Some(difference_ns) if self.differences => self.last_ns.saturating_add(difference_ns),
+            Some(time_ns) => time_ns,
+            None => {
+                let clock = std::str::from_utf8(time).ok().and_then(date_time_ns);
+                zone.utc_ns(clock.ok_or_else(fault)?)
+            }
+        };
+        self.last_ns = time_ns;
+        Ok(time_ns)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests;
+    use crate::Format;
+
+    fn as_log(screen: &str) -> (String, Vec<String>) {
+        let (records, issues) = tests::read(Format::CandumpScreen, screen);
+        (tests::write(Format::Candump, &records), issues)
+    }
+
+    #[test]
+    fn every_kind_of_line_is_read() {
+        let (log, issues) = as_log(
+            " (1436509052.249713)  vcan0  RX - -  044   [8]  2A 36 6E 4C 11 22 33 44   '*6nL.\"3D'\n \
+             (1436509052.249714)  vcan0  TX - -  18DAF110   [0] \n (1436509052.249715)  vcan0  RX - -  123   [2]  remote request\n \
+             (1436509052.249716)  vcan0  RX - -  321   {F}  01 02 03 04 05 06 07 08\n \
+             (1436509052.249717)  vcan1  RX - -  20000088   [8]  00 00 04 00 00 00 00 00   ERRORFRAME\n\
+             \tprotocol-violation{{bit-stuffing-error}{}}\n\tbus-error\n \
+             (1436509052.249718)  vcan1       \x1b[1;31m7FF\x1b[0m   [1]  AA\n",
+        );
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            log,
+            "(1436509052.249713) can0 044#2A366E4C11223344\n(1436509052.249714) can0 18DAF110# T\n\
+             (1436509052.249715) can0 123#R2\n(1436509052.249716) can0 321#0102030405060708_F\n\
+             (1436509052.249717) can1 20000088#0000040000000000\n(1436509052.249718) can1 7FF#AA\n"
+        );
+    }
+
+    #[test]
+    fn differences_are_added_up_and_times_from_the_start_are_not() {
+        let lines = |times: [&str; 4]| times.map(|time| format!(" ({time})  can0  123   [1]  11\n")).concat();
+        let differences = ["000.000000", "000.010000", "000.000500", "000.010000"];
+        let (log, _) = as_log(&lines(differences));
+        let stamps: Vec<_> = log.lines().map(|line| &line[..10]).collect();
+        assert_eq!(stamps, ["(0.000000)", "(0.010000)", "(0.010500)", "(0.020500)"]);
+        let even = ["000.000000", "000.010000", "000.010000", "000.010000"];
+        assert!(as_log(&lines(even)).0.contains("(0.030000)"));
+        let from_start = ["000.000000", "000.010000", "000.010000", "000.020500"];
+        assert!(as_log(&lines(from_start)).0.contains("(0.020500)"));
+        let absolute = ["2015-07-10 08:17:32.249713"; 4];
+        assert!(as_log(&lines(absolute)).0.starts_with("(1436516252.249713)"));
+    }
+
+    #[test]
+    fn frames_without_times_are_read_and_broken_lines_are_named() {
+        let (log, issues) = as_log(
+            "  can0  123   [2]  11 22\n  can0  123   [2]  11\n  can0  123   [2]  11 22 33\n  can0  1G3   [0]\n\
+             rubbish\n (x)  can0  123   [0]\n  can0  923   [0]\n  can0  123   [9]  11\n  can0  123   [2]  1",
+        );
+        assert_eq!(log, "(0.000000) can0 123#1122\n");
+        let line = "a line of candump such as 'can0  123   [2]  11 22'";
+        let stamp = "a time such as 1436509052.249713 or 2015-07-10 08:17:32.249713";
+        assert_eq!(
+            issues,
+            [
+                "test, line 2: expected 2 data bytes, found nothing".to_owned(),
+                "test, line 3: expected 2 data bytes, found '11 22 33'".to_owned(),
+                format!("test, line 4: expected {line}, found '  can0  1G3   [0]'"),
+                format!("test, line 5: expected {line}, found 'rubbish'"),
+                format!("test, line 6: expected {stamp}, found 'x'"),
+                "test, line 7: expected an identifier up to 7FF, or a mark that it is extended, found '923'"
+                    .to_owned(),
+                format!("test, line 8: expected {line}, found '  can0  123   [9]  11'"),
+                "test, line 9: the file ends inside a line; everything before it was read".to_owned(),
+            ]
+        );
+    }
+}

@@ -1,0 +1,232 @@
+//! How files are compressed: by suffix, by their first bytes.
+
+use std::io::{self, Read};
+use std::path::Path;
+
+/// A way to compress a file.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Compression {
+    Gzip,
+    Zstd,
+    Xz,
+    Lz4,
+}
+
+/// Each with its suffix and its first four bytes, as many of them as do not vary.
+const KNOWN: [(Compression, &str, &[u8]); 4] = [
+    (Compression::Gzip, ".gz", &[0x1F, 0x8B]),
+    (Compression::Zstd, ".zst", &[0x28, 0xB5, 0x2F, 0xFD]),
+    (Compression::Xz, ".xz", &[0xFD, b'7', b'z', b'X']),
+    (Compression::Lz4, ".lz4", &[0x04, 0x22, 0x4D, 0x18]),
+];
+
+/// So many bytes of a file tell how it is compressed.
+pub(crate) const MAGIC_BYTES: usize = 4;
+
+/// An xz file says how much memory it takes to unpack; `xz -9` takes 65 MiB. More than this is damage or malice.
+const XZ_MEMORY_KIB: u32 = 256 * 1024;
+
+/// What a build without zstd says to such a file.
+#[cfg(not(feature = "zstd"))]
+pub(crate) fn without_zstd() -> io::Error {
+    let reason = "this build has no zstd; build it with the feature `zstd`, or use gzip";
+    io::Error::new(io::ErrorKind::Unsupported, reason)
+}
+
+impl Compression {
+    /// By suffix: `.gz`, `.zst`, `.xz`, `.lz4`.
+    pub(crate) fn of_path(path: &Path) -> Option<Self> {
+        Self::split(&path.file_name()?.to_string_lossy()).1
+    }
+
+    /// A file's name without the suffix that says how it is compressed, and what that says.
+    pub(crate) fn split(name: &str) -> (&str, Option<Self>) {
+        KNOWN
+            .iter()
+            .find_map(|(compression, suffix, _)| {
+                let bare = name.len().checked_sub(suffix.len())?;
+                let ends = name.get(bare..)?.eq_ignore_ascii_case(suffix);
+                ends.then(|| (&name[..bare], Some(*compression)))
+            })
+            .unwrap_or((name, None))
+    }
+
+    /// By a file's first [`MAGIC_BYTES`].
+    pub(crate) fn of_content(head: &[u8]) -> Option<Self> {
+        KNOWN.iter().find(|(.., magic)| head.starts_with(magic)).map(|(compression, ..)| *compression)
+    }
+
+    /// What unpacks a file; several members, frames or streams one behind the other are one file.
+    pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
+        Ok(match self {
+            Self::Gzip => Box::new(flate2::read::MultiGzDecoder::new(source)),
+            #[cfg(feature = "zstd")]
+            Self::Zstd => Box::new(zstd::stream::read::Decoder::new(source)?),
+            #[cfg(not(feature = "zstd"))]
+            Self::Zstd => return Err(without_zstd()),
+            Self::Xz => Box::new(XzStreams::new(source)),
+            Self::Lz4 => Box::new(Lz4Frames::new(source)),
+        })
+    }
+}
+
+/// xz streams one behind the other: the crate's decoder takes a file that ends between two blocks for a whole one.
+struct XzStreams<R: Read>(lzma_rust2::XzReader<Tail<R>>);
+
+/// A source, and the last two bytes that came from it: zeros may follow a stream.
+struct Tail<R> {
+    source: R,
+    last: [u8; 2],
+}
+
+impl<R: Read> Read for Tail<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        let read = self.source.read(out)?;
+        for byte in out[..read].iter().filter(|byte| **byte != 0) {
+            self.last = [self.last[1], *byte];
+        }
+        Ok(read)
+    }
+}
+
+impl<R: Read> XzStreams<R> {
+    fn new(source: R) -> Self {
+        let source = Tail { source, last: [0; 2] };
+        Self(lzma_rust2::XzReader::new_mem_limit(source, true, XZ_MEMORY_KIB))
+    }
+}
+
+impl<R: Read> Read for XzStreams<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        /// What each stream ends with.
+        const END: &[u8; 2] = b"YZ";
+        let read = self.0.read(out)?;
+        if read == 0 && !out.is_empty() && self.0.inner().last != *END {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        Ok(read)
+    }
+}
+
+/// LZ4 frames one behind the other: the crate's decoder ends with the first.
+struct Lz4Frames<R: Read> {
+    decoder: lz4_flex::frame::FrameDecoder<Peeked<R>>,
+    /// Whether a frame has begun whose end mark was not seen.
+    within: bool,
+}
+
+/// A source of which a byte may have been looked at.
+struct Peeked<R> {
+    source: R,
+    byte: Option<u8>,
+    ended: bool,
+}
+
+impl<R: Read> Read for Peeked<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        match (self.byte, out) {
+            (Some(byte), [first, ..]) => {
+                *first = byte;
+                self.byte = None;
+                Ok(1)
+            }
+            (_, out) => {
+                let read = self.source.read(out)?;
+                self.ended |= read == 0 && !out.is_empty();
+                Ok(read)
+            }
+        }
+    }
+}
+
+impl<R: Read> Peeked<R> {
+    /// Whether nothing more comes.
+    fn is_at_end(&mut self) -> io::Result<bool> {
+        if self.byte.is_none() {
+            let mut byte = [0];
+            self.byte = (self.read(&mut byte)? == 1).then_some(byte[0]);
+        }
+        Ok(self.byte.is_none())
+    }
+}
+
+impl<R: Read> Lz4Frames<R> {
+    fn new(source: R) -> Self {
+        let source = Peeked { source, byte: None, ended: false };
+        Self { decoder: lz4_flex::frame::FrameDecoder::new(source), within: true }
+    }
+}
+
+impl<R: Read> Read for Lz4Frames<R> {
+    fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
+        if out.is_empty() {
+            return Ok(0);
+        }
+        loop {
+            let read = self.decoder.read(out)?;
+            if read > 0 {
+                return Ok(read);
+            }
+            // The decoder says the same of a frame's end mark and of a file that ends before it.
+            if self.decoder.get_ref().ended && self.within {
+                return Err(io::ErrorKind::UnexpectedEof.into());
+            }
+            self.within = !self.decoder.get_mut().is_at_end()?;
+            if !self.within {
+                return Ok(0);
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Write;
+
+    fn unpack(compression: Compression, bytes: &[u8]) -> (Vec<u8>, Option<io::ErrorKind>) {
+        let mut out = Vec::new();
+        let result = compression.unpack(io::Cursor::new(bytes.to_vec())).unwrap().read_to_end(&mut out);
+        (out, result.err().map(|error| error.kind()))
+    }
+
+    #[test]
+    fn pieces_one_behind_the_other_are_one_file_and_a_missing_end_is_noticed() {
+        let text = b"0123456789\n".repeat(20_000);
+        let xz = |bytes: &[u8]| {
+            let options = lzma_rust2::XzOptions::with_preset(1);
+            let mut writer = lzma_rust2::XzWriter::new(Vec::new(), options).unwrap();
+            writer.write_all(bytes).unwrap();
+            writer.finish().unwrap()
+        };
+        let lz4 = |bytes: &[u8]| {
+            let mut writer = lz4_flex::frame::FrameEncoder::new(Vec::new());
+            writer.write_all(bytes).unwrap();
+            writer.finish().unwrap()
+        };
+        let (first, second) = text.split_at(100_000);
+        for (compression, pieces) in
+            [(Compression::Xz, [xz(first), xz(second)]), (Compression::Lz4, [lz4(first), lz4(second)])]
+        {
+            let whole = pieces.concat();
+            assert_eq!(Compression::of_content(&whole), Some(compression));
+            assert_eq!(unpack(compression, &whole), (text.clone(), None));
+            let (read, error) = unpack(compression, &whole[..whole.len() - 4]);
+            assert!(text.starts_with(&read), "{compression:?}");
+            assert_eq!(error, Some(io::ErrorKind::UnexpectedEof), "{compression:?}");
+        }
+    }
+
+    #[test]
+    fn names_are_looked_through() {
+        for (name, bare, compression) in [
+            ("a.log.gz", "a.log", Some(Compression::Gzip)),
+            ("a.blf.XZ", "a.blf", Some(Compression::Xz)),
+            ("a.lz4", "a", Some(Compression::Lz4)),
+            ("µ", "µ", None),
+            ("a.gzip", "a.gzip", None),
+        ] {
+            assert_eq!(Compression::split(name), (bare, compression));
+        }
+    }
+}

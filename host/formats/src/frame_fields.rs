@@ -1,0 +1,143 @@
+//! From the fields of a row to an event, for the formats that have an identifier, a length and bytes side by side.
+
+use cantap_wire::{Frame, Id};
+
+use super::issue::Fault;
+use super::text;
+use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
+use cantap_trace::{Direction, FdFrame, TraceEvent};
+
+/// What a row says of a frame beside its bytes.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct FrameFields {
+    pub id: Id,
+    pub remote: bool,
+    pub direction: Direction,
+    /// The length as the row says it: of a classical frame the code of the bus, of one of CAN FD the number of bytes.
+    pub len: u8,
+    pub fd: Option<FdFields>,
+}
+
+/// What only frames of CAN FD have.
+#[derive(Clone, Copy, Debug, Default)]
+pub(crate) struct FdFields {
+    pub brs: bool,
+    pub esi: bool,
+}
+
+/// The bytes of a row.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Payload {
+    bytes: [u8; FD_MAX_BYTES],
+    len: usize,
+}
+
+impl Payload {
+    /// No bytes.
+    pub(crate) const EMPTY: Self = Self { bytes: [0; FD_MAX_BYTES], len: 0 };
+
+    /// At most 64 bytes.
+    pub(crate) fn of(bytes: &[u8]) -> Option<Self> {
+        let mut payload = Self::EMPTY;
+        payload.bytes.get_mut(..bytes.len())?.copy_from_slice(bytes);
+        payload.len = bytes.len();
+        Some(payload)
+    }
+
+    /// The first `len` of these words, each a byte as `parse` reads it. What stands behind them is not looked at.
+    pub(crate) fn words<'a>(
+        mut words: impl Iterator<Item = &'a [u8]>,
+        len: usize,
+        parse: impl Fn(&[u8]) -> Option<u8>,
+    ) -> Result<Self, Fault> {
+        let mut payload = Self::EMPTY;
+        let slots = payload.bytes.get_mut(..len);
+        let slots =
+            slots.ok_or_else(|| Fault::malformed("up to 64 data bytes", len.to_string().as_bytes()))?;
+        for slot in slots {
+            let word = words.next().unwrap_or_default();
+            *slot = parse(word).ok_or_else(|| Fault::malformed(format!("{len} data bytes"), word))?;
+        }
+        payload.len = len;
+        Ok(payload)
+    }
+
+    pub(crate) fn as_slice(&self) -> &[u8] {
+        &self.bytes[..self.len]
+    }
+
+    /// The first eight, zeros behind what is there: the form of a classical frame's data.
+    pub(crate) fn first_eight(&self) -> [u8; 8] {
+        self.bytes.first_chunk().copied().unwrap_or_default()
+    }
+}
+
+/// A byte of exactly two hexadecimal digits.
+pub(crate) fn hex_byte(word: &[u8]) -> Option<u8> {
+    match word {
+        [high, low] => text::hex_pair(*high, *low),
+        _ => None,
+    }
+}
+
+/// A byte in decimal digits.
+pub(crate) fn decimal_byte(word: &[u8]) -> Option<u8> {
+    text::decimal(word).and_then(|byte| u8::try_from(byte).ok())
+}
+
+/// An identifier that must fit its format.
+pub(crate) fn identifier(raw: u32, extended: bool, shown: &[u8]) -> Result<Id, Fault> {
+    let (id, expected) = if extended {
+        (Id::extended(raw), "an identifier up to 1FFFFFFF")
+    } else {
+        (Id::standard(raw), "an identifier up to 7FF, or a mark that it is extended")
+    };
+    id.ok_or_else(|| Fault::malformed(expected, shown))
+}
+
+/// A length code of the bus, as a number in decimal digits.
+pub(crate) fn length_code(word: &[u8]) -> Result<u8, Fault> {
+    let code = text::decimal(word).filter(|code| *code <= 15);
+    code.map(|code| code as u8).ok_or_else(|| Fault::malformed("a data length code of 0 to 15", word))
+}
+
+impl FrameFields {
+    /// The number of bytes that must be there.
+    pub(crate) fn data_len(&self) -> usize {
+        match self.fd {
+            _ if self.remote => 0,
+            None => usize::from(self.len.min(8)),
+            Some(_) => usize::from(self.len),
+        }
+    }
+
+    /// The frame with these bytes, of which there are as many as [`Self::data_len`] says.
+    pub(crate) fn event(&self, data: &Payload) -> Result<TraceEvent, Fault> {
+        let frame = match self.fd {
+            None => Frame::from_bus(self.id, self.remote, self.len, data.first_eight()).into(),
+            Some(FdFields { brs, esi }) => {
+                let bytes = data.as_slice();
+                let frame = FdFrame::new(self.id, brs, esi, bytes);
+                let found = || format!("{} bytes", bytes.len());
+                frame.ok_or_else(|| Fault::malformed("a length that CAN FD has", found().as_bytes()))?.into()
+            }
+        };
+        Ok(TraceEvent::Frame { frame, direction: self.direction, late: false })
+    }
+}
+
+/// The bytes that a length code, 0 to 15, stands for in a frame of CAN FD.
+pub(crate) fn fd_len(code: u8) -> u8 {
+    FD_LENGTHS[usize::from(code & 15)]
+}
+
+/// A direction as a word.
+pub(crate) fn direction(word: &[u8]) -> Result<Direction, Fault> {
+    if word.eq_ignore_ascii_case(b"rx") {
+        Ok(Direction::Rx)
+    } else if word.eq_ignore_ascii_case(b"tx") {
+        Ok(Direction::Tx)
+    } else {
+        Err(Fault::malformed("'Rx' or 'Tx'", word))
+    }
+}

@@ -1,0 +1,499 @@
+//! Reading MF4.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
+use std::io;
+
+use super::super::codec::Decode;
+use super::super::event_text::EventText;
+use super::super::found::Found;
+use super::super::frame_fields::{FdFields, FrameFields, Payload, fd_len, identifier};
+use super::super::input::Input;
+use super::super::issue::{Fault, Place};
+use super::super::whole::Whole;
+use super::super::zone::Zone;
+use super::blocks::{BLOCK_HEAD_BYTES, Block, u16_at, u32_at, u64_at};
+use super::layout::{BusGroup, Bytes, Content, Events, Field, Group};
+use super::stream::Stream;
+use super::{ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+const SIGNALS_PASSED_OVER: &str =
+    "groups of measured signals, which are no events of a bus, were passed over";
+
+/// What a file that was not finished has to be corrected in.
+pub(super) const OPEN_COUNTERS: u16 = 1;
+pub(super) const OPEN_LENGTH: u16 = 4;
+const OPEN_PLACES: u16 = 0x40;
+
+/// Records that wait for their bytes, and bytes that wait for their records: more apart than this is damage.
+const MAX_APART: usize = 1 << 16;
+
+/// Longest value of a record of varying length; a frame has 64 bytes.
+const MAX_VALUE_BYTES: usize = 1 << 20;
+
+/// Reads MF4.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    open: Option<Opened>,
+    /// What is to be told before the records.
+    first: VecDeque<Found>,
+}
+
+struct Opened {
+    file: Whole,
+    parts: Vec<Part>,
+    /// The time of the next record of each part that has one.
+    next: BinaryHeap<Reverse<(i64, usize)>>,
+}
+
+/// What comes out of a part next.
+enum Item {
+    Record(TraceRecord),
+    LeftOut(&'static str),
+    Fault(u64, Fault),
+}
+
+/// One stream of records, of one group or of several.
+struct Part {
+    start_ns: i64,
+    /// Bytes in front of each record that say of which group it is.
+    id_bytes: usize,
+    groups: Vec<Group>,
+    by_id: HashMap<u64, usize>,
+    /// Groups whose records are another group's bytes, by address.
+    values: HashMap<u64, Values>,
+    by_order: bool,
+    stream: Stream,
+    at: u64,
+    /// Records of each group so far.
+    counts: Vec<u64>,
+    /// Sorted: how many there are.
+    records: u64,
+    waiting: VecDeque<(usize, u64, Vec<u8>, u64)>,
+    time_ns: i64,
+    next: Option<Item>,
+    ended: bool,
+}
+
+/// Values by their place in the stream of all values of their group.
+#[derive(Default)]
+struct Values {
+    kept: BTreeMap<u64, Vec<u8>>,
+    /// The place of the next one.
+    end: u64,
+    /// Where places were not written: how many came, and how many were asked for.
+    came: u64,
+    asked: u64,
+}
+
+impl Decode for Decoder {
+    fn needs_one_line(&self) -> bool {
+        false
+    }
+
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if self.open.is_none() {
+            let zone = input.zone().clone();
+            let mut file = input.whole()?;
+            let (parts, fault) = match parts(&mut file, &zone, &mut self.first) {
+                Ok(parts) => (parts, None),
+                Err((parts, fault)) => (parts, Some(fault)),
+            };
+            if let Some(fault) = fault {
+                self.first.push_back(Found::Issue(Place::Offset(0), own(fault)?));
+            }
+            let mut open = Opened { file, parts, next: BinaryHeap::new() };
+            for part in 0..open.parts.len() {
+                open.advance(part)?;
+            }
+            self.open = Some(open);
+        }
+        if let Some(found) = self.first.pop_front() {
+            return Ok(found);
+        }
+        match &mut self.open {
+            Some(open) => open.next(),
+            None => Ok(Found::End),
+        }
+    }
+}
+
+/// Errors of the system end the reading; others are told.
+fn own(fault: Fault) -> io::Result<Fault> {
+    match fault {
+        Fault::Io(error) => Err(error),
+        other => Ok(other),
+    }
+}
+
+impl Opened {
+    fn next(&mut self) -> io::Result<Found> {
+        let Some(Reverse((_, part))) = self.next.pop() else { return Ok(Found::End) };
+        let item = self.parts[part].next.take();
+        self.advance(part)?;
+        Ok(match item {
+            Some(Item::Record(record)) => Found::Record(record),
+            Some(Item::LeftOut(what)) => Found::LeftOut(what),
+            Some(Item::Fault(at, fault)) => Found::Issue(Place::Offset(at), fault),
+            None => Found::End,
+        })
+    }
+
+    fn advance(&mut self, index: usize) -> io::Result<()> {
+        let part = &mut self.parts[index];
+        part.next = part.advance(&mut self.file)?;
+        match &part.next {
+            Some(Item::Record(record)) => part.time_ns = record.time_ns,
+            Some(Item::LeftOut(_) | Item::Fault(..)) => {}
+            None => return Ok(()),
+        }
+        self.next.push(Reverse((part.time_ns, index)));
+        Ok(())
+    }
+}
+
+/// The streams of records in a file; with a fault, those before it.
+fn parts(
+    file: &mut Whole,
+    zone: &Zone,
+    first: &mut VecDeque<Found>,
+) -> Result<Vec<Part>, (Vec<Part>, Fault)> {
+    let mut parts = Vec::new();
+    match collect(file, zone, first, &mut parts) {
+        Ok(()) => Ok(parts),
+        Err(fault) => Err((parts, fault)),
+    }
+}
+
+fn collect(
+    file: &mut Whole,
+    zone: &Zone,
+    first: &mut VecDeque<Found>,
+    parts: &mut Vec<Part>,
+) -> Result<(), Fault> {
+    const LOCAL_TIME: u8 = 1;
+    const UNFINISHED_AT: usize = 60;
+    let identification = file.read_at(0, HEADER_AT as usize)?;
+    let is_unfinished = identification.starts_with(UNFINISHED_MAGIC);
+    if !is_unfinished && !identification.starts_with(FILE_MAGIC) {
+        return Err(Fault::malformed(
+            "a file that begins with 'MDF'",
+            identification.get(..8).unwrap_or(&identification),
+        ));
+    }
+    if identification.get(8..10).is_some_and(|version| version != b"4.") {
+        let version = String::from_utf8_lossy(&identification[8..12]).trim().to_owned();
+        return Err(Fault::Unsupported(format!("MDF {version}, which is older than 4.0,").into()));
+    }
+    let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };
+    let header = file.block(HEADER_AT, *b"##HD")?;
+    let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
+    let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
+    let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
+    let (mut next, mut count) = (header.link(0), 0);
+    while next != 0 {
+        let group = file.block(next, *b"##DG")?;
+        next = group.link(0);
+        count += 1;
+        if count * BLOCK_HEAD_BYTES > file.len() {
+            return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
+        }
+        match Part::open(file, &group, open, start_ns) {
+            Ok((part, signals)) => {
+                first.extend((0..signals).map(|_| Found::Note(SIGNALS_PASSED_OVER)));
+                parts.extend(part);
+            }
+            Err(Fault::Io(error)) => return Err(error.into()),
+            Err(fault) => first.push_back(Found::Issue(Place::Offset(next), fault)),
+        }
+    }
+    Ok(())
+}
+
+impl Part {
+    /// What a group of data holds, if events of a bus are in it; and how many groups in it are signals.
+    fn open(file: &mut Whole, block: &Block, open: u16, start_ns: i64) -> Result<(Option<Self>, u32), Fault> {
+        let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
+        let open_end = open & OPEN_LENGTH != 0;
+        let (mut groups, mut next) = (Vec::new(), block.link(1));
+        while next != 0 {
+            let (group, behind) = Group::open(file, next, open_end)?;
+            groups.push(group);
+            next = behind;
+            if groups.len() as u64 * BLOCK_HEAD_BYTES > file.len() {
+                return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
+            }
+        }
+        let signals = groups.iter().filter(|group| matches!(group.content, Content::Signals)).count() as u32;
+        if !groups.iter().any(|group| matches!(group.content, Content::Bus(_))) {
+            return Ok((None, signals));
+        }
+        if groups.len() > 1 && ![1, 2, 4, 8].contains(&id_bytes) {
+            let found = format!("{id_bytes} bytes");
+            return Err(Fault::malformed("records that say of which group they are", found.as_bytes()));
+        }
+        let by_id = groups.iter().enumerate().map(|(at, group)| (group.record_id, at)).collect();
+        let values = groups.iter().filter(|group| matches!(group.content, Content::Values));
+        let values = values.map(|group| (group.address, Values::default())).collect();
+        let stream = Stream::open(file, block.link(2), open_end)?;
+        let is_sorted = groups.len() == 1 && id_bytes == 0;
+        let counted = is_sorted && open & OPEN_COUNTERS == 0;
+        let records = if counted { groups[0].records } else { u64::MAX };
+        let part = Self {
+            start_ns,
+            id_bytes,
+            counts: vec![0; groups.len()],
+            groups,
+            by_id,
+            values,
+            by_order: open & OPEN_PLACES != 0,
+            stream,
+            at: 0,
+            records,
+            waiting: VecDeque::new(),
+            time_ns: start_ns,
+            next: None,
+            ended: false,
+        };
+        Ok((Some(part), signals))
+    }
+
+    fn advance(&mut self, file: &mut Whole) -> io::Result<Option<Item>> {
+        match self.step(file) {
+            Ok(item) => Ok(item),
+            Err(fault) => {
+                // Where one record ends and the next begins is not known any more.
+                self.ended = true;
+                Ok(Some(Item::Fault(self.at, own(fault)?)))
+            }
+        }
+    }
+
+    fn step(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
+        loop {
+            if let Some(item) = self.of_waiting(file)? {
+                return Ok(Some(item));
+            }
+            if self.ended {
+                return Ok(None);
+            }
+            let place = self.at;
+            let Some(group) = self.group(file)? else {
+                self.ended = true;
+                if let Some((_, _, _, place)) = self.waiting.pop_front() {
+                    let rest = std::mem::take(&mut self.waiting).len() + 1;
+                    let found = format!("{rest} frames without theirs");
+                    let fault = Fault::malformed("the bytes of each frame", found.as_bytes());
+                    return Ok(Some(Item::Fault(place, fault)));
+                }
+                let is_short = self.records != u64::MAX && self.counts[0] < self.records;
+                if self.stream.is_cut() || is_short || self.at < self.stream.len() && self.records == u64::MAX
+                {
+                    return Ok(Some(Item::Fault(self.at, Fault::Truncated("a group of frames"))));
+                }
+                return Ok(None);
+            };
+            match &self.groups[group].content {
+                Content::Values => {
+                    let Some(head) = self.stream.at(file, self.at, 4)? else { return Ok(Some(self.cut())) };
+                    let len = u32_at(head, 0) as usize;
+                    if len > MAX_VALUE_BYTES {
+                        return Err(Fault::malformed("a value of up to 1 MiB", len.to_string().as_bytes()));
+                    }
+                    let Some(value) = self.stream.at(file, self.at + 4, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    let value = value.to_vec();
+                    self.at += 4 + len as u64;
+                    if let Some(values) = self.values.get_mut(&self.groups[group].address) {
+                        values.keep(value, self.by_order);
+                    }
+                }
+                Content::Signals | Content::Bus(_) => {
+                    let len = self.groups[group].record_bytes;
+                    let Some(record) = self.stream.at(file, self.at, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    let record = record.to_vec();
+                    self.at += len as u64;
+                    let number = self.counts[group];
+                    self.counts[group] += 1;
+                    if matches!(self.groups[group].content, Content::Bus(_)) {
+                        if self.waiting.len() >= MAX_APART {
+                            return Err(Fault::malformed("the bytes of a frame near it", b"none"));
+                        }
+                        self.waiting.push_back((group, number, record, place));
+                    }
+                }
+            }
+        }
+    }
+
+    fn cut(&mut self) -> Item {
+        self.ended = true;
+        Item::Fault(self.at, Fault::Truncated("a record"))
+    }
+
+    /// The group of the next record; `None` at the end.
+    fn group(&mut self, file: &mut Whole) -> Result<Option<usize>, Fault> {
+        let is_over = self.counts.first().is_some_and(|count| *count >= self.records);
+        if self.at >= self.stream.len() || is_over {
+            return Ok(None);
+        }
+        if self.id_bytes == 0 {
+            // A record of no bytes would never end.
+            let len = self.groups[0].record_bytes as u64;
+            return Ok((len > 0 && self.at + len <= self.stream.len()).then_some(0));
+        }
+        let Some(id) = self.stream.at(file, self.at, self.id_bytes)? else { return Ok(None) };
+        let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
+        self.at += self.id_bytes as u64;
+        let group = self.by_id.get(&id).copied();
+        let group =
+            group.ok_or_else(|| Fault::malformed("a record of a known group", id.to_string().as_bytes()))?;
+        Ok(Some(group))
+    }
+
+    /// The record that has waited longest, if its bytes are there.
+    fn of_waiting(&mut self, file: &mut Whole) -> Result<Option<Item>, Fault> {
+        let Some((group, number, record, place)) = self.waiting.front() else { return Ok(None) };
+        let place = *place;
+        if let Content::Bus(bus) = &self.groups[*group].content
+            && let Events::Other(what) = bus.events
+        {
+            self.waiting.pop_front();
+            return Ok(Some(Item::LeftOut(what)));
+        }
+        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
+        let apart = match &mut bus.bytes {
+            None | Some(Bytes::Here(_)) => None,
+            Some(Bytes::Stream { place, stream }) => {
+                let at = place.unsigned(record).unwrap_or(u64::MAX);
+                let len = stream.at(file, at, 4)?.map_or(0, |head| u32_at(head, 0));
+                Some(stream.at(file, at.saturating_add(4), len as usize)?.unwrap_or_default().to_vec())
+            }
+            Some(Bytes::Group { place, address }) => {
+                let Some(values) = self.values.get_mut(address) else {
+                    return Err(Fault::malformed("the group that has the bytes of frames", b"none"));
+                };
+                let at = place.unsigned(record).unwrap_or(u64::MAX);
+                match values.take(at, self.by_order) {
+                    Some(value) => Some(value),
+                    None => return Ok(None),
+                }
+            }
+        };
+        let item = match bus.record(record, *number, apart.as_deref(), self.start_ns) {
+            Ok(record) => Item::Record(record),
+            Err(fault) => Item::Fault(place, fault),
+        };
+        self.waiting.pop_front();
+        Ok(Some(item))
+    }
+}
+
+impl Values {
+    fn keep(&mut self, value: Vec<u8>, by_order: bool) {
+        let place = if by_order { self.came } else { self.end };
+        self.came += 1;
+        self.end += 4 + value.len() as u64;
+        self.kept.insert(place, value);
+        if self.kept.len() > MAX_APART {
+            self.kept.pop_first();
+        }
+    }
+
+    fn take(&mut self, place: u64, by_order: bool) -> Option<Vec<u8>> {
+        let place = if by_order { self.asked } else { place };
+        let value = self.kept.remove(&place)?;
+        self.asked += 1;
+        Some(value)
+    }
+}
+
+impl BusGroup {
+    /// What a record says. `apart`: its frame's bytes, where they are not in it.
+    fn record(
+        &self,
+        record: &[u8],
+        number: u64,
+        apart: Option<&[u8]>,
+        start_ns: i64,
+    ) -> Result<TraceRecord, Fault> {
+        let offset_ns = self.clock.ns(record, number);
+        let offset_ns = offset_ns.ok_or_else(|| Fault::malformed("a time within 292 years", b"another"))?;
+        let time_ns = start_ns.saturating_add(offset_ns);
+        let channel = match &self.bus_channel {
+            None => self.bus,
+            Some(field) => {
+                let channel = field.unsigned(record);
+                let fault = || Fault::malformed("a channel of 0 to 255", format!("{channel:?}").as_bytes());
+                channel.and_then(|channel| u8::try_from(channel).ok()).ok_or_else(fault)?
+            }
+        };
+        let event = match self.events {
+            Events::Frames => self.frame(record, apart, false)?,
+            Events::RemoteFrames => self.frame(record, None, true)?,
+            Events::ErrorFrames => self.words(record).unwrap_or_else(|| {
+                let number = self.error_type.and_then(|field| field.unsigned(record));
+                let known = ERROR_TYPES.iter().find(|(known, _)| Some(*known) == number);
+                TraceEvent::BusError { kind: known.map(|(_, kind)| *kind), counters: None }
+            }),
+            Events::Words => {
+                let fault = || Fault::malformed("an event such as 'lost 5 queue'", b"other words");
+                self.words(record).ok_or_else(fault)?
+            }
+            Events::Other(_) => return Err(Fault::malformed("an event of CAN", b"another")),
+        };
+        Ok(TraceRecord { time_ns, channel, event })
+    }
+
+    fn words(&self, record: &[u8]) -> Option<TraceEvent> {
+        let bytes = self.words?.bytes(record)?;
+        let text = bytes.split(|byte| *byte == 0).next()?;
+        let EventText(event) = std::str::from_utf8(text).ok()?.parse().ok()?;
+        Some(event)
+    }
+
+    fn frame(&self, record: &[u8], apart: Option<&[u8]>, remote: bool) -> Result<TraceEvent, Fault> {
+        const EXTENDED: u64 = 1 << 31;
+        const IDENTIFIER: u64 = (1 << 29) - 1;
+        let number = |field: &Option<Field>| field.and_then(|field| field.unsigned(record));
+        let flag = |field: &Option<Field>, text: &[u8]| field.is_some_and(|field| field.flag(record, text));
+        let raw = number(&self.id).ok_or_else(|| Fault::malformed("a frame's identifier", b"none"))?;
+        let extended = match &self.ide {
+            Some(_) => flag(&self.ide, b"E"),
+            None => raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF,
+        };
+        let id = (raw & IDENTIFIER) as u32;
+        let id = identifier(id, extended, format!("{id:X}").as_bytes())?;
+        let is_fd = flag(&self.edl, b"1");
+        let code = number(&self.dlc);
+        let fd = is_fd.then(|| FdFields { brs: flag(&self.brs, b"1"), esi: flag(&self.esi, b"1") });
+        let direction = if flag(&self.dir, b"T") { Direction::Tx } else { Direction::Rx };
+        let longest = if is_fd { 64 } else { 8 };
+        let of_code = |code: u64| if is_fd { u64::from(fd_len(code as u8)) } else { code.min(8) };
+        let fields = |len| FrameFields { id, remote, direction, len, fd };
+        if remote {
+            let code = code.filter(|code| *code <= 15);
+            let code = code.ok_or_else(|| Fault::malformed("a data length code of 0 to 15", b"another"))?;
+            return fields(code as u8).event(&Payload::EMPTY);
+        }
+        let here = match &self.bytes {
+            Some(Bytes::Here(field)) => field.bytes(record),
+            _ => apart,
+        };
+        let here = here.unwrap_or_default();
+        let len = number(&self.data_length).or(code.map(of_code)).unwrap_or(here.len() as u64);
+        let data = here.get(..len as usize).filter(|_| len <= longest).and_then(Payload::of);
+        let fault = || {
+            let found = format!("{len} of {}", here.len());
+            Fault::malformed(format!("up to {longest} data bytes"), found.as_bytes())
+        };
+        let data = data.ok_or_else(fault)?;
+        // A classical frame's code can say more than its eight bytes.
+        let code = code.filter(|code| !is_fd && len == 8 && (9..=15).contains(code));
+        fields(code.unwrap_or(len) as u8).event(&data)
+    }
+}

@@ -1,0 +1,222 @@
+//! The data of a group or of a channel: bytes that lie in one block or in many, plain or compressed.
+
+use std::io::Read;
+
+use super::super::issue::Fault;
+use super::super::whole::Whole;
+use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
+
+/// Plain data is read in pieces of so many bytes.
+const PIECE_BYTES: u64 = 1 << 20;
+
+/// The standard has at most 4 MiB in a compressed block; other programs write more. Larger is damage.
+const MAX_UNPACKED_BYTES: u64 = 256 << 20;
+
+/// Lists of lists no deeper than this.
+const MAX_DEPTH: u32 = 4;
+
+/// Fields of a compressed block in front of its data.
+const DZ_FIELDS_BYTES: u64 = 24;
+
+/// A piece of the stream that is in the file in one place.
+#[derive(Clone, Copy, Debug)]
+struct Piece {
+    /// Where it begins in the stream, and how long it is there.
+    start: u64,
+    len: u64,
+    /// Where it is in the file.
+    at: u64,
+    packed: Option<Packed>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct Packed {
+    /// Bytes in the file.
+    stored: u64,
+    /// 0 deflate, 2 zstd, 4 LZ4; the odd ones the same with rows and columns exchanged.
+    kind: u8,
+    /// How many columns were exchanged with rows.
+    columns: u32,
+}
+
+/// A stream of bytes, read at any place, quickly where that is behind the last one.
+#[derive(Default)]
+pub(super) struct Stream {
+    pieces: Vec<Piece>,
+    /// Bytes in all.
+    len: u64,
+    /// Whether bytes are missing at the end of the file.
+    cut: bool,
+    /// What was read last, and where in the stream it begins.
+    buffer: Vec<u8>,
+    buffer_start: u64,
+}
+
+impl Stream {
+    /// The data behind a link. `open_end`: the last block's length was not written, and it goes to the end of the file.
+    pub(super) fn open(file: &mut Whole, link: u64, open_end: bool) -> Result<Self, Fault> {
+        let mut stream = Self::default();
+        if link != 0 {
+            stream.collect(file, link, open_end, 0)?;
+        }
+        Ok(stream)
+    }
+
+    /// Bytes in all.
+    pub(super) fn len(&self) -> u64 {
+        self.len
+    }
+
+    /// Whether the file ends before the stream does.
+    pub(super) fn is_cut(&self) -> bool {
+        self.cut
+    }
+
+    fn push(&mut self, len: u64, at: u64, packed: Option<Packed>) {
+        if len > 0 {
+            self.pieces.push(Piece { start: self.len, len, at, packed });
+            self.len += len;
+        }
+    }
+
+    fn collect(&mut self, file: &mut Whole, link: u64, open_end: bool, depth: u32) -> Result<(), Fault> {
+        let head = file.head(link)?;
+        match &head.name {
+            b"##DT" | b"##SD" | b"##RD" => {
+                let begin = link + BLOCK_HEAD_BYTES;
+                let there = file.len().saturating_sub(begin);
+                let says = head.len - BLOCK_HEAD_BYTES;
+                let len = if open_end && says == 0 { there } else { says };
+                self.cut |= len > there;
+                self.push(len.min(there), begin, None);
+            }
+            b"##DZ" => {
+                let fields = file.read_at(link + BLOCK_HEAD_BYTES, DZ_FIELDS_BYTES as usize)?;
+                let (kind, columns) = (fields.get(2).copied().unwrap_or(0), u32_at(&fields, 4));
+                let (unpacked, stored) = (u64_at(&fields, 8), u64_at(&fields, 16));
+                if kind > 5 || unpacked > MAX_UNPACKED_BYTES {
+                    let found = format!("kind {kind}, {unpacked} bytes");
+                    let expected = format!("data compressed in a known way at {link:#x}");
+                    return Err(Fault::malformed(expected, found.as_bytes()));
+                }
+                let at = link + BLOCK_HEAD_BYTES + DZ_FIELDS_BYTES;
+                if at.saturating_add(stored) > file.len() {
+                    // What is left of it cannot be put in order, or ends in the middle of a record.
+                    self.cut = true;
+                } else {
+                    self.push(unpacked, at, Some(Packed { stored, kind, columns }));
+                }
+            }
+            b"##HL" if depth < MAX_DEPTH => {
+                let list = file.block(link, *b"##HL")?;
+                if list.link(0) != 0 {
+                    self.collect(file, list.link(0), open_end, depth + 1)?;
+                }
+            }
+            b"##DL" if depth < MAX_DEPTH => {
+                let (mut next, mut lists) = (link, 0);
+                while next != 0 {
+                    let list = file.block(next, *b"##DL")?;
+                    for data in list.links.iter().skip(1).filter(|link| **link != 0) {
+                        self.collect(file, *data, open_end, depth + 1)?;
+                    }
+                    next = list.link(0);
+                    lists += 1;
+                    if lists * BLOCK_HEAD_BYTES > file.len() {
+                        return Err(Fault::malformed("a list of data that ends", b"a circle of links"));
+                    }
+                }
+            }
+            name => {
+                let name = String::from_utf8_lossy(name).into_owned();
+                return Err(Fault::Unsupported(
+                    format!("data kept in columns (block {name}, MDF 4.2)").into(),
+                ));
+            }
+        }
+        Ok(())
+    }
+
+    /// `len` bytes from a place on; `None` if the stream has not so many there.
+    pub(super) fn at(&mut self, file: &mut Whole, at: u64, len: usize) -> Result<Option<&[u8]>, Fault> {
+        let Some(end) = at.checked_add(len as u64).filter(|end| *end <= self.len) else { return Ok(None) };
+        let is_held = |stream: &Self| {
+            at >= stream.buffer_start && end <= stream.buffer_start + stream.buffer.len() as u64
+        };
+        if !is_held(self) {
+            self.load(file, at, end)?;
+        }
+        let from = (at - self.buffer_start) as usize;
+        Ok(self.buffer.get(from..from + len))
+    }
+
+    /// Makes the buffer hold these bytes.
+    fn load(&mut self, file: &mut Whole, at: u64, end: u64) -> Result<(), Fault> {
+        let held_until = self.buffer_start + self.buffer.len() as u64;
+        if at >= self.buffer_start && at <= held_until {
+            self.buffer.drain(..(at - self.buffer_start) as usize);
+            self.buffer_start = at;
+        } else {
+            self.buffer.clear();
+            let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= at);
+            let piece = self.pieces[holds];
+            self.buffer_start = if piece.packed.is_some() { piece.start } else { at };
+        }
+        loop {
+            let loaded = self.buffer_start + self.buffer.len() as u64;
+            if loaded >= end {
+                return Ok(());
+            }
+            let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= loaded);
+            let Some(piece) = self.pieces.get(holds).copied() else { return Ok(()) };
+            let bytes = if let Some(packed) = piece.packed {
+                unpack(file, piece, packed)?
+            } else {
+                let within = loaded - piece.start;
+                let len = (piece.len - within).min(PIECE_BYTES);
+                file.read_at(piece.at + within, len as usize)?
+            };
+            self.buffer.extend_from_slice(&bytes);
+        }
+    }
+}
+
+/// A compressed piece, whole.
+fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fault> {
+    let stored = file.read_at(piece.at, packed.stored as usize)?;
+    let len = piece.len as usize;
+    let mut bytes = Vec::with_capacity(len.min(stored.len().saturating_mul(64)));
+    let source: Box<dyn Read> = match packed.kind & !1 {
+        0 => Box::new(flate2::read::ZlibDecoder::new(&stored[..])),
+        #[cfg(feature = "zstd")]
+        2 => Box::new(zstd::stream::read::Decoder::new(&stored[..])?),
+        #[cfg(not(feature = "zstd"))]
+        2 => return Err(crate::compression::without_zstd().into()),
+        _ => Box::new(lz4_flex::frame::FrameDecoder::new(&stored[..])),
+    };
+    let result = source.take(piece.len + 1).read_to_end(&mut bytes);
+    if result.is_err() || bytes.len() != len {
+        let found = format!("{} of {len} bytes", bytes.len());
+        let expected = format!("compressed data at {:#x}", piece.at);
+        return Err(Fault::malformed(expected, found.as_bytes()));
+    }
+    let columns = packed.columns as usize;
+    if packed.kind & 1 == 1 && columns > 1 {
+        bytes = exchange(&bytes, columns);
+    }
+    Ok(bytes)
+}
+
+/// Columns one behind the other as rows. What is no whole row stands unchanged at the end.
+fn exchange(columns_first: &[u8], columns: usize) -> Vec<u8> {
+    let rows = columns_first.len() / columns;
+    let mut bytes = columns_first.to_vec();
+    if rows > 0 {
+        for (column, values) in columns_first[..rows * columns].chunks_exact(rows).enumerate() {
+            for (row, value) in values.iter().enumerate() {
+                bytes[row * columns + column] = *value;
+            }
+        }
+    }
+    bytes
+}

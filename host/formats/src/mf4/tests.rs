@@ -1,0 +1,183 @@
+//! Files as other programs arrange them, made by hand: bytes apart from their records, data in lists, compressed.
+
+use std::io::Write;
+
+use super::super::tests;
+use super::encode::Blocks;
+use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
+use crate::Format;
+
+const START_NS: u64 = 1_410_714_882_000_000_000;
+
+/// A record has a time, an identifier, a length code and the place of its bytes.
+const RECORD_BYTES: usize = 21;
+const LINK_TO_DATA: usize = 24 + 5 * 8;
+
+fn records() -> Vec<(u32, Vec<u8>)> {
+    (0..100).map(|at| (0x100 + at, vec![at as u8; at as usize % 9])).collect()
+}
+
+/// What stands in the log of these.
+fn log() -> String {
+    let line = |(at, (id, bytes)): (usize, (u32, Vec<u8>))| {
+        let data = bytes.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
+        format!("(1410714882.{:06}) can1 {id:03X}#{data}\n", at * 500)
+    };
+    records().into_iter().enumerate().map(line).collect::<Vec<_>>().concat()
+}
+
+fn record(at: usize, id: u32, len: usize, place: u64) -> Vec<u8> {
+    let mut record = (at as f64 * 0.0005).to_le_bytes().to_vec();
+    record.extend(id.to_le_bytes());
+    record.push(len as u8);
+    record.extend(place.to_le_bytes());
+    assert_eq!(record.len(), RECORD_BYTES);
+    record
+}
+
+/// A file's blocks up to its group of frames, whose address and whose channel of bytes' are returned.
+fn begin() -> (Blocks, u64, usize) {
+    let mut blocks = Blocks(vec![0; HEADER_AT as usize + 104]);
+    let mut names =
+        ["t", "CAN_DataFrame", "CAN_DataFrame.ID", "CAN_DataFrame.DLC", "CAN_DataFrame.DataBytes", "CAN2"]
+            .map(|name| blocks.text(*b"##TX", name));
+    let bytes = blocks.channel(0, names[4], [1, 0], &("", 13, 0, 64, 0), [0; 3]);
+    let code = blocks.channel(bytes, names[3], [0, 0], &("", 12, 0, 4, 0), [0; 3]);
+    let id = blocks.channel(code, names[2], [0, 0], &("", 8, 0, 32, 0), [0; 3]);
+    let frame = blocks.channel(0, names[1], [0, 0], &("", 8, 0, 104, 10), [id, 0, 0]);
+    let time = blocks.channel(frame, names[0], [2, 1], &("", 0, 0, 64, 4), [0; 3]);
+    let source = blocks.push(*b"##SI", &[std::mem::take(&mut names[5]), 0, 0], &[2, 2, 0, 0, 0, 0, 0, 0]);
+    let group = group(&mut blocks, 1, 0, RECORD_BYTES as u32, [0, time, source]);
+    (blocks, group, bytes as usize)
+}
+
+fn group(blocks: &mut Blocks, id: u64, flags: u16, bytes: u32, [next, first, source]: [u64; 3]) -> u64 {
+    let mut data = id.to_le_bytes().to_vec();
+    data.extend(100_u64.to_le_bytes());
+    data.extend(flags.to_le_bytes());
+    data.extend([b'.', 0, 0, 0, 0, 0]);
+    data.extend(bytes.to_le_bytes());
+    data.extend([0; 4]);
+    blocks.push(*b"##CG", &[next, first, 0, source, 0, 0], &data)
+}
+
+fn finish(mut blocks: Blocks, group: u64, data: u64, id_bytes: u8, open: u16) -> Vec<u8> {
+    let data_group = blocks.push(*b"##DG", &[0, group, data, 0], &[id_bytes, 0, 0, 0, 0, 0, 0, 0]);
+    let mut header = Blocks(Vec::new());
+    let mut date = START_NS.to_le_bytes().to_vec();
+    date.resize(32, 0);
+    header.push(*b"##HD", &[data_group, 0, 0, 0, 0, 0], &date);
+    let mut file = blocks.0;
+    file[HEADER_AT as usize..][..104].copy_from_slice(&header.0);
+    file[..8].copy_from_slice(if open == 0 { FILE_MAGIC } else { UNFINISHED_MAGIC });
+    file[8..12].copy_from_slice(b"4.10");
+    file[60..62].copy_from_slice(&open.to_le_bytes());
+    file
+}
+
+fn as_log(file: &[u8]) -> (String, Vec<String>) {
+    let (records, issues) = tests::read(Format::Mf4, file);
+    (tests::write(Format::Candump, &records), issues)
+}
+
+/// A block of compressed data, rows and columns exchanged if there are columns.
+fn packed(blocks: &mut Blocks, of: [u8; 2], bytes: &[u8], columns: usize) -> u64 {
+    let mut stored = bytes.to_vec();
+    let rows = bytes.len().checked_div(columns).unwrap_or(0);
+    for (at, byte) in bytes[..rows * columns].iter().enumerate() {
+        stored[at % columns * rows + at / columns] = *byte;
+    }
+    let mut encoder = flate2::write::ZlibEncoder::new(Vec::new(), flate2::Compression::fast());
+    encoder.write_all(&stored).unwrap();
+    let stored = encoder.finish().unwrap();
+    let mut data = vec![of[0], of[1], u8::from(columns > 0), 0];
+    data.extend((columns as u32).to_le_bytes());
+    data.extend((bytes.len() as u64).to_le_bytes());
+    data.extend((stored.len() as u64).to_le_bytes());
+    data.extend(stored);
+    blocks.push(*b"##DZ", &[], &data)
+}
+
+/// A list of blocks, of which the last goes on in a second list.
+fn list(blocks: &mut Blocks, data: &[u64]) -> u64 {
+    let (last, first) = data.split_last().unwrap();
+    let second = blocks.push(*b"##DL", &[0, *last], &[0; 8]);
+    let links: Vec<u64> = [second].iter().chain(first).copied().collect();
+    let first = blocks.push(*b"##DL", &links, &[0; 8]);
+    blocks.push(*b"##HL", &[first], &[0; 8])
+}
+
+#[test]
+fn bytes_in_a_stream_of_their_own_and_data_in_lists_plain_and_compressed_are_read() {
+    let (mut blocks, group, bytes) = begin();
+    let (mut data, mut values) = (Vec::new(), Vec::new());
+    for (at, (id, value)) in records().into_iter().enumerate() {
+        data.extend(record(at, id, value.len(), values.len() as u64));
+        values.extend((value.len() as u32).to_le_bytes());
+        values.extend(value);
+    }
+    // Records and values go on from block to block.
+    let (first, rest) = data.split_at(1000);
+    let (second, third) = rest.split_at(500);
+    let pieces = [
+        packed(&mut blocks, *b"DT", first, RECORD_BYTES),
+        blocks.push(*b"##DT", &[], second),
+        packed(&mut blocks, *b"DT", third, 0),
+    ];
+    let data = list(&mut blocks, &pieces);
+    let (first, second) = values.split_at(333);
+    let pieces = [packed(&mut blocks, *b"SD", first, 0), blocks.push(*b"##SD", &[], second)];
+    let values = list(&mut blocks, &pieces);
+    blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+    let file = finish(blocks, group, data, 0, 0);
+    assert_eq!(as_log(&file), (log(), Vec::new()));
+    // Cut before the group and the lists, nothing can be read, which is said.
+    for keep in [file.len() - 1, file.len() / 2, 200, 70, 3] {
+        let (log, issues) = as_log(&file[..keep]);
+        assert!(log.is_empty() && issues.len() == 1, "{keep}: {issues:?}");
+    }
+}
+
+/// A logger writes the bytes of a frame before or behind it, and does not finish the file.
+#[test]
+fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_order() {
+    for by_order in [false, true] {
+        let (mut blocks, frames, bytes) = begin();
+        let values = group(&mut blocks, 2, 1, 0, [0; 3]);
+        // The group of values is the next one behind that of frames.
+        blocks.0[frames as usize + 24..][..8].copy_from_slice(&values.to_le_bytes());
+        blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+        let (mut data, mut place) = (Vec::new(), 0);
+        for (at, (id, value)) in records().into_iter().enumerate() {
+            let place_told = if by_order { 0 } else { place };
+            let frame = [vec![1], record(at, id, value.len(), place_told)].concat();
+            let value = [&[2][..], &(value.len() as u32).to_le_bytes(), &value].concat();
+            place += value.len() as u64 - 1;
+            let (first, second) = if at % 3 == 0 { (frame, value) } else { (value, frame) };
+            data.extend(first);
+            data.extend(second);
+        }
+        let open = if by_order { 0x45 } else { 5 };
+        // The last block's length was not written.
+        let group_at = blocks.0.len() as u64;
+        let data_at = group_at + 24 + 32 + 8;
+        let mut file = finish(blocks, frames, data_at, 1, open);
+        file.extend([&b"##DT\0\0\0\0"[..], &24_u64.to_le_bytes(), &[0; 8], &data].concat());
+        assert_eq!(as_log(&file), (log(), Vec::new()), "{by_order}");
+        let (cut, issues) = as_log(&file[..file.len() - 3]);
+        assert!(log().starts_with(&cut) && cut.lines().count() == 99, "{cut}");
+        assert_eq!(issues.len(), 1, "{issues:?}");
+    }
+}
+
+#[test]
+fn what_is_no_mdf_4_is_named() {
+    for (file, message) in [
+        (b"MDF     3.30    ".to_vec(), "MDF 3.30, which is older than 4.0, cannot be represented"),
+        (b"rubbish and more".to_vec(), "expected a file that begins with 'MDF', found 'rubbish '"),
+        (b"MDF     4.10    ".to_vec(), "the file ends inside what describes the measurement"),
+    ] {
+        let (records, issues) = tests::read(Format::Mf4, file);
+        assert!(records.is_empty() && issues.len() == 1 && issues[0].contains(message), "{issues:?}");
+    }
+}

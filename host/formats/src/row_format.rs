@@ -1,0 +1,95 @@
+//! Formats with one event in each line: what reads the lines is here, what a line says is the format's.
+
+use std::io;
+
+use super::codec::Decode;
+use super::error_frames::ErrorFrames;
+use super::found::Found;
+use super::input::Input;
+use super::issue::{Fault, Place};
+use super::zone::Zone;
+use cantap_trace::{TraceEvent, TraceRecord};
+
+/// What a line says.
+pub(crate) enum Line {
+    /// An event.
+    Record(TraceRecord),
+    /// Two at the same time.
+    Two(TraceRecord, TraceEvent),
+    /// Nothing of the bus: part of the head, a comment, an empty line.
+    Nothing,
+}
+
+/// A format of lines.
+pub(crate) trait RowFormat: Send {
+    /// Looks ahead, before the first line.
+    fn begin(&mut self, _buffered: &[u8]) {}
+
+    /// What a line says. It has neither line end nor space around it, but where [`Self::trims`] says so.
+    fn line(&mut self, line: &[u8], zone: &Zone) -> Result<Line, Fault>;
+
+    /// Whether a last line that reads well, and has no line end, may have lost the end of what it says.
+    fn may_be_cut(&self, _line: &[u8], _record: &TraceRecord) -> bool {
+        true
+    }
+
+    /// What else there is to know of the last line, to be counted.
+    fn note(&mut self) -> Option<&'static str> {
+        None
+    }
+
+    /// What is missing at the end of a file, the same for any file of another format.
+    fn missing(&self) -> Option<&'static str> {
+        None
+    }
+
+    /// Whether space in front of a line means nothing.
+    fn trims(&self) -> bool {
+        true
+    }
+}
+
+/// Reads the lines of a format.
+#[derive(Default)]
+pub(crate) struct Rows<F> {
+    format: F,
+    begun: bool,
+    ended: bool,
+    more: ErrorFrames,
+}
+
+impl<F: RowFormat> Decode for Rows<F> {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(found) = self.more.next() {
+            return Ok(found);
+        }
+        if let Some(note) = self.format.note() {
+            return Ok(Found::Note(note));
+        }
+        if !std::mem::replace(&mut self.begun, true) {
+            self.format.begin(input.buffered());
+        }
+        let zone = input.zone().clone();
+        while let Some(line) = input.line()? {
+            let end = line.text.trim_ascii_end();
+            let text = if self.format.trims() { end.trim_ascii_start() } else { end };
+            match self.format.line(text, &zone) {
+                Ok(Line::Nothing) => {}
+                Ok(Line::Record(record)) if !line.terminated && self.format.may_be_cut(text, &record) => {
+                    return Ok(line.cut());
+                }
+                Ok(Line::Record(record)) => return Ok(Found::Record(record)),
+                Ok(Line::Two(..)) if !line.terminated => return Ok(line.cut()),
+                Ok(Line::Two(record, second)) => {
+                    self.more.keep([TraceRecord { event: second, ..record }]);
+                    return Ok(Found::Record(record));
+                }
+                Err(fault) => return Ok(line.issue(fault)),
+            }
+        }
+        let missing = self.format.missing().filter(|_| !std::mem::replace(&mut self.ended, true));
+        Ok(missing.map_or(Found::End, |expected| {
+            Found::Issue(Place::Line(input.line_number()), Fault::malformed(expected, b""))
+        }))
+    }
+}

@@ -197,7 +197,7 @@ impl Decode for Decoder {
             }
         }
         // Whether a compressed file is whole is known at its end.
-        while !input.may_wait() && !input.peek(1)?.is_empty() {
+        while !input.follows() && !input.peek(1)?.is_empty() {
             input.consume(input.buffered().len());
         }
         Ok(Found::End)

@@ -190,6 +190,11 @@ impl Input {
         self.may_wait
     }
 
+    /// Whether its end only means "not yet".
+    pub(crate) fn follows(&self) -> bool {
+        self.follow
+    }
+
     /// Whether a whole line has been read and is not used up.
     pub(crate) fn has_line(&self) -> bool {
         memchr::memchr(b'\n', &self.buffer[self.start..self.end]).is_some()

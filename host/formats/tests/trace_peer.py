@@ -80,7 +80,9 @@ def write(lines, paths):
         # Only the candump log and what is printed name interfaces; MF4 counts from 1.
         named = suffix_of(path) in (".log", ".txt")
         first = 1 if suffix_of(path) == ".mf4" else 0
-        with can.Logger(path) as logger:
+        # a0.mf4 is plain, a1.mf4 deflated, a2.mf4 with rows and columns exchanged before.
+        options = {"compression_level": int(Path(path).stem[-1])} if first else {}
+        with can.Logger(path, **options) as logger:
             for message in messages:
                 number = message.channel
                 message.channel = f"can{number}" if named else number + first

@@ -413,6 +413,8 @@ const DIFFERENT: &[(&str, &str)] = &[
         "channel 4370 is shown as 255, the last; and a microsecond is rounded the other way",
     ),
     ("test_CanErrorFrames.asc", "an error frame is nobody's to have sent"),
+    ("test_CanFdMessage.blf", "channel 4370 is an issue here"),
+    ("test_CanFdMessage64.blf", "an identifier of 31 bits is an issue here"),
     ("test_CanFdRemoteMessage.asc", "a remote frame in a CANFD row is a classical one"),
     ("test_CanMessage.asc.gz", "the date has PM behind it, which python-can does not read"),
     ("test_CanMessage.blf", "a mere request to send is no frame on the bus"),

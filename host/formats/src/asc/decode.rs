@@ -267,7 +267,8 @@ impl Decoder {
         }
         let (_duration, _bits, word) = (next(), next(), next());
         let flags = text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?;
-        let frame = if flags & FD_FORMAT != 0 {
+        // Programs are about that leave the flags out; more than eight bytes say it too.
+        let frame = if flags & FD_FORMAT != 0 || len > 8 {
             let frame = FdFrame::new(id, brs, esi, &data[..len]);
             frame.filter(|_| usize::from(FD_LENGTHS[usize::from(dlc)]) == len).map(TraceFrame::Fd)
         } else {

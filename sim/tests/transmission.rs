@@ -36,9 +36,9 @@ fn saturate(rig: &mut Rig, channel: Channel, ms: u64) {
     rig.add_traffic(channel, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + ms * MS));
 }
 
-/// How late a confirmation's stamp may be: a request's packet is read from USB with interrupts masked.
+/// How late a stamp may be, beside anything: nothing masks the interrupt that stamps, only another stamp delays it.
 fn latest_stamp_us(bound: Bound) -> f64 {
-    if bound == Best { 3.5 } else { 5.0 }
+    if bound == Best { 0.6 } else { 1.0 }
 }
 
 /// Spacing within so much of the plan's, and each confirmation's stamp soon after the frame's end.
@@ -76,7 +76,7 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
         let Some(mut rig) = joined_under(bound, &[Can1]) else { return };
         saturate(&mut rig, Can2, 280);
         let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
-        let within_us = if bound == Best { 1.0 } else { 2.0 };
+        let within_us = if bound == Best { 0.8 } else { 1.6 };
         hold_times(bound, &format!("beside 100 % at {load} %"), replayed.as_deref(), within_us);
         rig.run_for(100 * MS).unwrap();
         rig.close(Can2).unwrap();
@@ -85,8 +85,7 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
         assert_eq!(rig.ledger.losses(Can2).total(), 0);
         let stamps = rig.ledger.stamps();
         eprintln!("  the other channel's stamps {stamps:?}");
-        let spread_ns = if bound == Best { 3_200 } else { 5_000 };
-        assert!(stamps.max - stamps.min <= spread_ns, "{bound}: {stamps:?}");
+        assert!(stamps.max as f64 <= 1000.0 * latest_stamp_us(bound), "{bound}: {stamps:?}");
     }
 }
 

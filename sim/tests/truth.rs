@@ -67,11 +67,10 @@ fn frame(text: &str) -> Frame {
     text.parse().unwrap()
 }
 
-/// At 1 Mbit/s receivers take a frame 1 us before its end, so stamps 0 to 2 us after that are within 1 us of the
-/// end of frame, and those to 3.5 us within 2.5.
+/// At 1 Mbit/s receivers take a frame 1 us before its end, which is then still to come when it is stamped.
 #[test]
-fn stamps_are_within_a_microsecond_of_the_end_of_frame_under_full_load_and_within_three_at_worst() {
-    for (bound, latest_ns) in [(Bound::Best, 2000), (Bound::Worst, 3500)] {
+fn stamps_are_at_most_a_microsecond_late_under_full_load() {
+    for (bound, latest_ns) in [(Bound::Best, 600), (Bound::Worst, 1000)] {
         let Some(mut rig) = listening_under(bound) else { return };
         let from = rig.now();
         for (channel, kind) in [(Channel::Can1, Kind::Std0), (Channel::Can2, Kind::Mix)] {

@@ -2,8 +2,8 @@
 //!
 //! That is made for cores that cannot read a word across a word's boundary: it puts such words together from two, in some 22 cycles for
 //! four bytes, and copies less than 16 bytes one by one. Records have any length, so nearly nothing that is copied here is aligned. A
-//! Cortex-M4 reads and writes unaligned words in normal memory by itself, at a cycle more (Cortex-M4 technical reference manual,
-//! "Load/store timings"); start-up leaves CCR.UNALIGN_TRP off. Registers are never copied like this.
+//! Cortex-M4's LDR and STR take unaligned words in memory, and are a little slower then (Cortex-M4 devices generic user guide, ARM DUI 0553A,
+//! 3.3.5); CCR.UNALIGN_TRP, which would make them fault, is off after a reset. Registers are never copied like this.
 
 use core::arch::global_asm;
 

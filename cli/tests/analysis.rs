@@ -162,3 +162,36 @@ fn the_live_view_of_the_virtual_device_loses_nothing() {
     assert!(text.contains("Channel 1: 1000000 bit/s") && text.contains("Channel 2: 1000000 bit/s"), "{text}");
     assert_eq!(text.matches("Lost               0 ").count(), 2, "{text}");
 }
+
+/// A channel that only has errors begins where the trace does, not in 1970, and nothing begins at minus zero.
+#[test]
+fn windows_count_from_the_traces_start() {
+    let folder = tempfile::tempdir().unwrap();
+    let log = folder.path().join("errors.log");
+    std::fs::write(
+        &log,
+        "(1800000000.000000) can0 20000008#0000040000000000\n(1800000000.500000) can1 123#1122\n\
+         (1800000003.000000) can0 20000008#0000040000000000\n(1800000003.100000) can1 123#1122\n",
+    )
+    .unwrap();
+    let text = stdout(cantap().arg("stats").arg(&log).args(["-b", "500k", "--windows"]));
+    assert!(!text.contains("-0.000"), "{text}");
+    assert!(!text.contains("180000000"), "{text}");
+    let part = [
+        "plot",
+        "--bus-load",
+        "-b",
+        "500k",
+        "--start",
+        "0.2",
+        "--end",
+        "3.05",
+        "--y",
+        "0:50",
+        "--width",
+        "100",
+    ];
+    let text = stdout(cantap().args(part).arg(&log));
+    assert!(text.contains("2027-01-15 08:00:00.500000 UTC"), "{text}");
+    run(cantap().args(["plot", "--bus-load", "--y", "50:0"]).arg(&log), 2);
+}

@@ -8,15 +8,16 @@ use std::time::Duration;
 use anyhow::bail;
 use cantap::Id;
 use cantap_analysis::plot::{
-    DEFAULT_WIDTH, LoadCollector, MOST_CURVES, PictureFormat, Plot, SignalCollector, TextStyle,
-    TimingCollector,
+    Axis, Content, DEFAULT_WIDTH, LoadCollector, MOST_CURVES, PictureFormat, Plot, SignalCollector,
+    TextStyle, TimingCollector,
 };
 use cantap_analysis::stats::Options;
+use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
 
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::DatabaseArgs;
-use crate::input::{ReadArgs, Records};
+use crate::input::ReadArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -53,6 +54,18 @@ pub struct Args {
     /// Width: pixels in a file, columns in the terminal.
     #[arg(long)]
     width: Option<u32>,
+    /// Leave out what is before: a time since the trace's start (10s, 2m), a date, or seconds since 1970.
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    start: Option<TimePoint>,
+    /// Leave out what is from there on: as --start.
+    #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
+    end: Option<TimePoint>,
+    /// The vertical range, LOW:HIGH.
+    #[arg(long = "y", value_name = "LOW:HIGH", value_parser = vertical, allow_hyphen_values = true)]
+    vertical: Option<(f64, f64)>,
+    /// Draw up to so many signals.
+    #[arg(long, value_name = "N", default_value_t = MOST_CURVES)]
+    curves: usize,
     /// Heading; the trace's name without it.
     #[arg(long)]
     title: Option<String>,
@@ -69,7 +82,12 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(path) = &args.output {
         PictureFormat::of_path(path)?;
     }
-    let plot = collect(args)?;
+    let mut plot = collect(args)?;
+    for pane in &mut plot.panes {
+        if matches!(pane.content, Content::Analogue(_)) {
+            pane.range = args.vertical.or(pane.range);
+        }
+    }
     match &args.output {
         Some(path) => plot.save(path, args.width.unwrap_or(DEFAULT_WIDTH))?,
         None => std::io::stdout().lock().write_all(plot.to_text(&terminal_style(args)).as_bytes())?,
@@ -83,12 +101,12 @@ fn collect(args: &Args) -> anyhow::Result<Plot> {
     if args.bus_load {
         let options = Options { window: args.window, ..ChannelBitrate::options(&args.bitrates) };
         let mut collector = LoadCollector::new(options)?;
-        for_each(args.read.open(&args.input)?, |record| collector.push(record))?;
-        return Ok(collector.finish(title("bus load")));
+        let first_ns = for_each(args, |record| collector.push(record))?;
+        return Ok(dated(collector.finish(title("bus load")), first_ns));
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
-        for_each(args.read.open(&args.input)?, |record| collector.push(record))?;
+        for_each(args, |record| collector.push(record))?;
         let plot = collector.finish(title(&format!("periods of {id}")));
         if plot.panes.is_empty() {
             bail!("there are no two frames of {id} without a loss between them in {name}");
@@ -101,23 +119,52 @@ fn collect(args: &Args) -> anyhow::Result<Plot> {
         );
     }
     let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
-    let mut collector = SignalCollector::new(&decoder);
-    for_each(args.read.open(&args.input)?, |record| collector.push(record))?;
+    let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
+    let first_ns = for_each(args, |record| collector.push(record))?;
     if collector.is_empty() {
         bail!("none of the signals is in {name}; `cantap decode` shows what is");
     }
     if collector.left_out() > 0 {
-        eprintln!("cantap: only the first {MOST_CURVES} signals are drawn; choose with --signal PATTERN");
+        let curves = args.curves;
+        eprintln!(
+            "cantap: only the first {curves} signals are drawn; choose with --signal PATTERN, or draw more with --curves"
+        );
     }
-    Ok(collector.finish(title("signals")))
+    Ok(dated(collector.finish(title("signals")), first_ns))
 }
 
-fn for_each(mut records: Records, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<()> {
+/// Reads the part of the trace that is to be drawn; returns when it begins.
+fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<Option<i64>> {
+    let mut records = args.read.open(&args.input)?;
+    let mut window = TimeRange::new(args.start, args.end);
     let mut batch = Vec::new();
+    let mut first_ns = None;
     while records.next_batch(&mut batch)? {
-        batch.iter().for_each(&mut take);
+        for record in batch.iter().filter(|record| window.contains(record)) {
+            first_ns = first_ns.or(Some(record.time_ns));
+            take(record);
+        }
     }
-    Ok(())
+    Ok(first_ns)
+}
+
+/// The plot with the date of its beginning on its axis.
+fn dated(plot: Plot, first_ns: Option<i64>) -> Plot {
+    let Some(date) = first_ns.and_then(date_text) else { return plot };
+    let axis = match plot.axis {
+        Axis::Time { zero } => Axis::Time { zero: format!("{date} ({zero})") },
+        axis @ Axis::Value { .. } => axis,
+    };
+    Plot { axis, ..plot }
+}
+
+/// `0:100`, `-40:85`.
+fn vertical(text: &str) -> Result<(f64, f64), String> {
+    let parse = |text: &str| text.trim().parse::<f64>().ok().filter(|value| value.is_finite());
+    let range = text.split_once(':').and_then(|(low, high)| parse(low).zip(parse(high)));
+    range
+        .filter(|(low, high)| low < high)
+        .ok_or_else(|| "write the range as LOW:HIGH, such as 0:100".to_owned())
 }
 
 /// What the terminal can show; a file or pipe gets no colours.

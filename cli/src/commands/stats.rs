@@ -140,7 +140,7 @@ fn write_json(summary: &Summary, windows: Option<Windows>, out: &mut impl Write)
 }
 
 fn write_windows(summary: &Summary, windows: Windows, out: &mut impl Write) -> anyhow::Result<()> {
-    let zero_s = summary.channels.first().and_then(|channel| channel.first_s).unwrap_or(0.0);
+    let zero_s = summary.origin_s.unwrap_or(0.0);
     let mut head = "\nWindows\n";
     windows.for_each(|window| {
         let window: PeakSummary = serde_json::from_str(window)?;

@@ -2,7 +2,7 @@
 
 use std::str::FromStr;
 
-use crate::{date_time_ns, decimal_seconds_ns};
+use crate::{calendar, date_time_ns, decimal_seconds_ns};
 use cantap_trace::TraceRecord;
 
 /// A point in a trace.
@@ -45,6 +45,18 @@ impl FromStr for TimePoint {
     }
 }
 
+/// The date of a time in nanoseconds since the Unix epoch, with microseconds; `None` where a trace's times are from its own
+/// start.
+pub fn date_text(time_ns: i64) -> Option<String> {
+    if time_ns < calendar::FIRST_DATE_NS {
+        return None;
+    }
+    let date = calendar::Date::of(time_ns);
+    let (hour, minute, second, ns) = date.clock();
+    let (year, month, day, us) = (date.year, date.month, date.day, ns / 1000);
+    Some(format!("{year:04}-{month:02}-{day:02} {hour:02}:{minute:02}:{second:02}.{us:06} UTC"))
+}
+
 /// Which part of a trace. The start belongs to it, the end does not.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct TimeRange {
@@ -75,6 +87,12 @@ impl TimeRange {
 mod tests {
     use super::*;
     use cantap_trace::testing::data_record;
+
+    #[test]
+    fn a_time_of_the_clock_has_a_date() {
+        assert_eq!(date_text(1_410_714_882_622_188_000).unwrap(), "2014-09-14 17:14:42.622188 UTC");
+        assert_eq!(date_text(12_500_000_000), None);
+    }
 
     #[test]
     fn points_are_seconds_from_the_first_record_or_dates() {

@@ -18,7 +18,7 @@ pub enum DatabaseError {
     },
     /// The suffix is that of no database.
     #[error(
-        "{file} is no known kind of database; use a .dbc, .kcd or .sym file, or a .toml signal file (docs/signal-file.md)"
+        "{file} is no known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.

@@ -8,6 +8,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod arxml;
 mod clean;
 pub mod condition;
 pub mod dbc;
@@ -46,7 +47,7 @@ pub use number::Number;
 pub use plan::SignalValue;
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, or `.toml` for cantap's own signal file.
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file.
 ///
 /// Faults that leave a database usable are in [`Database::warnings`].
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
@@ -55,6 +56,7 @@ pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     let parse: fn(&str, &[u8]) -> Result<Database, DatabaseError> = match suffix.to_ascii_lowercase().as_str()
     {
         "dbc" => dbc::parse,
+        "arxml" => arxml::parse,
         "kcd" => kcd::parse,
         "sym" => sym::parse,
         "toml" => file::parse,

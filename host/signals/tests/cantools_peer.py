@@ -76,7 +76,7 @@ def fetch(directory):
         subprocess.run([*command, f"cantools=={version('cantools')}", "--dest", directory], check=True)
         with contextlib.closing(tarfile.open(directory / f"{release}.tar.gz")) as archive:
             archive.extractall(directory, filter="data")
-    for kind in ("dbc", "kcd", "sym"):
+    for kind in ("dbc", "kcd", "sym", "arxml"):
         files = (directory / release / "tests" / "files" / kind).iterdir()
         print("\n".join(sorted(str(path) for path in files if path.suffix.lower() == f".{kind}")))
 

@@ -20,6 +20,8 @@ const REFUSED: &[(&str, &str)] = &[
         "incorrect-sig_valtype.dbc",
         "a SIG_VALTYPE_ for an unknown signal is a warning here: nothing decodes wrong for it",
     ),
+    ("ecu-extract-4.2.arxml", "a control unit's configuration, which has no CAN frames"),
+    ("system-DAI-3.1.2.arxml", "nothing but the file's head: no frame is an error here"),
     ("issue_138.sym", "a multiplexer without bits is a name for the only variant there is"),
     ("jopp-5.0.sym", "version 5 is read here"),
     ("incorrect-val.dbc", "a VAL_ for an unknown signal is a warning here: nothing decodes wrong for it"),
@@ -32,6 +34,14 @@ const DIFFERENT: &[(&str, &str, &str)] = &[
         "Message1",
         "the signal ends beyond its message: cantools decodes nothing, here it is left out",
     ),
+    (
+        "system-3.2.3.arxml",
+        "Multiplexed",
+        "the selector is a signal of the static part too: here it keeps that name beside",
+    ),
+    ("system-4.2.arxml", "MultiplexedMessage", "as in the file of version 3"),
+    ("system-4.2.arxml", "Message3", "a secured PDU, of which cantools knows the parts, is left out"),
+    ("system-4.2.arxml", "Message4", "numbers in one's complement are not read: the message is left out"),
     ("bad_message_length.kcd", "Message1", "as in the DBC file"),
     ("bad_message_length.sym", "Message1", "as in the DBC file"),
     ("message_layout.kcd", "Message3", "the signal ends beyond its message"),
@@ -191,7 +201,10 @@ fn compare(files: &[PathBuf]) -> Option<(Vec<String>, usize, usize)> {
             match (&line.refused, ours) {
                 (None, Ok(database)) => {
                     databases += 1;
-                    if line.messages != Some(database.messages.len()) {
+                    let left_out = DIFFERENT
+                        .iter()
+                        .filter(|(file, _, why)| *file == name && why.ends_with("the message is left out"));
+                    if line.messages != Some(database.messages.len() + left_out.count()) {
                         unexpected.push(format!(
                             "{name}: {} messages here, {:?} there",
                             database.messages.len(),

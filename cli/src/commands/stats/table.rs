@@ -130,6 +130,12 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     if channel.out_of_order > 0 {
         let _ = writeln!(out, "  times     {} records are older than the one before", channel.out_of_order);
     }
+    if let Some(step_s) = channel.stamp_step_s {
+        let _ = writeln!(
+            out,
+            "  times     the stamps are multiples of {step_s} s, coarser than the frames: shorter periods and windows say nothing"
+        );
+    }
     if channel.late > 0 {
         let _ = writeln!(out, "  times     {} frames have only an upper bound", channel.late);
     }
@@ -138,7 +144,7 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
     }
     if !channel.peaks.is_empty() {
         out.push_str("  busiest windows\n");
-        let zero_s = channel.first_s.or(summary.first_s).unwrap_or(0.0);
+        let zero_s = summary.origin_s.unwrap_or(0.0);
         for window in &channel.peaks {
             let _ = writeln!(out, "{}", window_line(window, zero_s));
         }
@@ -158,12 +164,12 @@ fn listed(counts: &[(u64, &str)]) -> String {
 /// A window with its start relative to `zero_s`.
 pub(super) fn window_line(window: &PeakSummary, zero_s: f64) -> String {
     let load = window.load_pct.map_or(String::new(), |load| format!("{load:>8.3} %"));
+    // What rounds to nothing has no sign.
+    let since_s = window.start_s - zero_s;
+    let since_s = if since_s.abs() < 0.000_5 { 0.0 } else { since_s };
     let line = format!(
         "    {} {:>+12.3} s {load} {:>9.1} frames/s {:>9.0} bit/s",
-        window.channel,
-        window.start_s - zero_s,
-        window.frames_per_s,
-        window.bits_per_s
+        window.channel, since_s, window.frames_per_s, window.bits_per_s
     );
     line + &remarks(window.errors, window.lost, window.incomplete)
 }

@@ -36,11 +36,16 @@ fn data(plot: &Plot, scene: &Scene) -> String {
         let [red, green, blue] = colour_of(curve, index);
         let _ = write!(
             out,
-            "{comma}{{\"name\":{},\"unit\":{},\"colour\":\"#{red:02x}{green:02x}{blue:02x}\",\"stepped\":{},\"points\":[",
+            "{comma}{{\"name\":{},\"unit\":{},\"colour\":\"#{red:02x}{green:02x}{blue:02x}\",\"stepped\":{},\"texts\":[",
             quoted(&curve.name),
             quoted(&pane.label),
             curve.stepped
         );
+        for (index, (value, text)) in curve.texts.iter().enumerate() {
+            let comma = if index == 0 { "" } else { "," };
+            let _ = write!(out, "{comma}[{value},{}]", quoted(text));
+        }
+        out.push_str("],\"points\":[");
         for (index, point) in curve.series.points().iter().enumerate() {
             let comma = if index == 0 { "" } else { "," };
             if point.y.is_nan() {
@@ -123,7 +128,9 @@ svg.addEventListener("mousemove", (event) => {
   plot.curves.forEach((curve, index) => {
     if (hidden.has(index)) return;
     const value = valueAt(curve, x);
-    add(`${curve.name} ${value === null ? "–" : +value.toPrecision(6)} ${curve.unit}`, curve.colour);
+    const text = curve.texts.find((entry) => entry[0] === value);
+    const shown = value === null ? "–" : +value.toPrecision(6) + (text ? ` (${text[1]})` : "");
+    add(`${curve.name} ${shown} ${curve.unit}`, curve.colour);
   });
 });
 svg.addEventListener("mouseleave", () => { cursor.remove(); values.textContent = ""; });

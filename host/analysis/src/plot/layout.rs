@@ -114,7 +114,14 @@ fn legend(pane: &Pane, top: f32, first_curve: usize, scene: &mut Scene) -> f32 {
     let mut x = LEFT;
     let mut baseline = top + 16.0;
     if !pane.label.is_empty() {
-        text(scene, (LEFT - 10.0, baseline), TEXT_SIZE, Anchor::End, SOFT_INK, &pane.label);
+        let width = pane.label.chars().count() as f32 * CHARACTER_WIDTH;
+        if width <= LEFT - 14.0 {
+            text(scene, (LEFT - 10.0, baseline), TEXT_SIZE, Anchor::End, SOFT_INK, &pane.label);
+        } else {
+            // A long unit has the room that it needs, and the names follow it.
+            text(scene, (4.0, baseline), TEXT_SIZE, Anchor::Start, SOFT_INK, &pane.label);
+            x = (4.0 + width + 14.0).max(LEFT);
+        }
     }
     if matches!(pane.content, Content::Digital(_)) {
         // Each lane has its own name.
@@ -225,19 +232,24 @@ fn grid(plot: &Plot, pane: &Pane, places: &Places, scene: &mut Scene) {
             let y = area.top + LANE_HEIGHT * lane as f32;
             line(scene, vec![(area.left, y), (area.right, y)], GRID, 1.0, false, None);
         }
-        for lane in 0..curves.len() {
+        for (lane, curve) in curves.iter().enumerate() {
             let PaneArea { left, top, bottom, .. } = lane_area(&area, lane);
-            for (y, label) in [(top, "1"), (bottom, "0")] {
-                text(scene, (left - 8.0, y + 4.0), 11.0, Anchor::End, SOFT_INK, label);
+            let named = |value: f64, otherwise: &str| {
+                let texts = &curve.texts;
+                let found =
+                    texts.iter().find(|(of, _)| (of - value).abs() < 1e-9).map(|(_, text)| text.as_str());
+                fitting(found.unwrap_or(otherwise), left - 12.0, 11.0)
+            };
+            for (y, label) in [(top, named(1.0, "1")), (bottom, named(0.0, "0"))] {
+                text(scene, (left - 8.0, y + 4.0), 11.0, Anchor::End, SOFT_INK, &label);
             }
         }
         return;
     }
-    let (ticks, step) = scale::ticks(places.y, 5);
-    for tick in ticks {
+    for (tick, label) in pane.ticks(places.y, 5) {
         let y = places.y(tick);
         line(scene, vec![(area.left, y), (area.right, y)], GRID, 1.0, false, None);
-        let label = scale::label(tick, step);
+        let label = fitting(&label, area.left - 12.0, TEXT_SIZE);
         text(scene, (area.left - 8.0, y + 4.5), TEXT_SIZE, Anchor::End, SOFT_INK, &label);
     }
 }
@@ -324,6 +336,15 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
         scene.shapes.push(Shape::Area { x, y: top + 28.0, width: 12.0, height: 12.0, colour: LOSS });
         text(scene, (x + 18.0, top + 38.0), TEXT_SIZE, Anchor::Start, SOFT_INK, &note);
     }
+}
+
+/// The text, cut where it would not fit so many units.
+fn fitting(text: &str, width: f32, size: f32) -> String {
+    let most = (width / (size * 0.62)) as usize;
+    if text.chars().count() <= most {
+        return text.to_owned();
+    }
+    text.chars().take(most.saturating_sub(1)).chain(['…']).collect()
 }
 
 /// What the horizontal axis shows.

@@ -1,7 +1,7 @@
 //! What is to be seen: panes above each other that share a horizontal axis.
 
 use super::histogram::Bar;
-use super::scale::Range;
+use super::scale::{self, Range};
 use super::series::Series;
 
 /// A picture.
@@ -96,6 +96,10 @@ pub struct Curve {
     pub alarm_below: Option<f64>,
     /// Above this value it is an alarm: shaded red.
     pub alarm_above: Option<f64>,
+    /// Texts for values, in ascending order of the table's: shown on the axis and at the cursor.
+    pub texts: Vec<(f64, String)>,
+    /// Has whole numbers only, so that nothing between them is on its axis.
+    pub whole: bool,
 }
 
 impl Curve {
@@ -108,7 +112,40 @@ impl Curve {
             stepped: false,
             alarm_below: None,
             alarm_above: None,
+            texts: Vec::new(),
+            whole: false,
         }
+    }
+}
+
+impl Pane {
+    /// Whether its vertical axis has whole numbers only.
+    pub(super) fn is_whole(&self) -> bool {
+        match &self.content {
+            Content::Bars(_) => true,
+            Content::Analogue(curves) => !curves.is_empty() && curves.iter().all(|curve| curve.whole),
+            Content::Digital(_) => false,
+        }
+    }
+
+    /// The texts on its vertical axis, if it is one curve's alone.
+    pub(super) fn texts(&self) -> &[(f64, String)] {
+        match &self.content {
+            Content::Analogue(curves) if curves.len() == 1 => &curves[0].texts,
+            _ => &[],
+        }
+    }
+
+    /// Ticks of the vertical axis, about `wanted` of them, with what stands at them.
+    pub(super) fn ticks(&self, range: (f64, f64), wanted: usize) -> Vec<(f64, String)> {
+        let shown = |(value, _): &&(f64, String)| (range.0..=range.1).contains(value);
+        let texts: Vec<_> = self.texts().iter().filter(shown).cloned().collect();
+        if !texts.is_empty() && texts.len() <= wanted * 2 {
+            return texts;
+        }
+        let (ticks, step) =
+            if self.is_whole() { scale::whole_ticks(range, wanted) } else { scale::ticks(range, wanted) };
+        ticks.into_iter().map(|tick| (tick, scale::label(tick, step))).collect()
     }
 }
 
@@ -123,10 +160,10 @@ impl Plot {
                 }
             }
             if let Content::Bars(bars) = &pane.content {
-                // A clock's ticks, all alike, are one bar and no wall.
+                // From zero, so that the scatter is seen for what it is beside the period.
+                span.include(0.0);
                 for bar in bars {
-                    span.include(bar.from - 10.0 * (bar.to - bar.from));
-                    span.include(bar.to + 10.0 * (bar.to - bar.from));
+                    span.include(bar.to * 1.05);
                 }
             }
         }

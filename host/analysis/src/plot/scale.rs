@@ -39,6 +39,12 @@ pub(super) fn ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     multiples((low, high), step.unwrap_or(rough))
 }
 
+/// As [`ticks`], at whole numbers only.
+pub(super) fn whole_ticks(range: (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
+    let (found, step) = ticks(range, wanted);
+    if step < 1.0 { multiples(range, 1.0) } else { (found, step) }
+}
+
 /// Ticks for seconds: as [`ticks`] up to a second, then parts of minutes, hours and days.
 pub(super) fn time_ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     const STEPS: [f64; 21] = [

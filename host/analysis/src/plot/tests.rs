@@ -135,6 +135,49 @@ fn a_terminal_shows_a_ramp_rising_from_corner_to_corner() {
     assert!(plot.to_text(&TextStyle { unicode: true, ..style }).contains("       On│▁▁▁"));
 }
 
+/// What a value means stands where it is, and whole numbers have nothing between them.
+#[test]
+fn axes_name_states_and_whole_numbers() {
+    let mut gear = Curve::new("Gear");
+    gear.stepped = true;
+    gear.whole = true;
+    gear.texts = vec![(0.0, "Park".to_owned()), (1.0, "Reverse <R>".to_owned())];
+    let mut count = Curve::new("Count");
+    count.whole = true;
+    let mut on = Curve::new("On");
+    on.texts = vec![(0.0, "closed".to_owned()), (1.0, "open".to_owned())];
+    for curve in [&mut gear, &mut count, &mut on] {
+        for (x, y) in [(0.0, 0.0), (1.0, 1.0), (2.0, 0.0)] {
+            curve.series.push(x, y);
+        }
+    }
+    let pane = |label: &str, content| Pane { label: label.to_owned(), range: None, content };
+    let plot = Plot {
+        panes: vec![
+            pane("", Content::Analogue(vec![gear])),
+            pane("a long unit, to be read", Content::Analogue(vec![count])),
+            pane("", Content::Digital(vec![on])),
+        ],
+        ..Plot::default()
+    };
+    let svg = String::from_utf8(plot.render(PictureFormat::Svg, 800).unwrap()).unwrap();
+    for part in [">Park<", ">Reverse…<", ">open<", ">closed<", ">a long unit, to be read<"] {
+        assert!(svg.contains(part), "{part}: {svg}");
+    }
+    // The time axis has halves.
+    assert!(!svg.contains("text-anchor=\"end\" fill=\"#666666\">0.5<"), "{svg}");
+    let html = String::from_utf8(plot.render(PictureFormat::Html, 800).unwrap()).unwrap();
+    assert!(html.contains("\"texts\":[[0,\"Park\"],[1,\"Reverse \\u003cR\\u003e\"]]"), "{html}");
+    let text = plot.to_text(&TextStyle { unicode: false, ..TextStyle::default() });
+    assert!(text.contains("Park+") && text.contains("a long unit, to be read -- Count"), "{text}");
+}
+
+#[test]
+fn periods_are_drawn_from_zero() {
+    let span = histogram().span();
+    assert!(span.0 == 0.0 && span.1 > 10.0, "{span:?}");
+}
+
 #[test]
 fn colour_is_used_only_where_asked_for() {
     let plot = drive();

@@ -55,14 +55,14 @@ pub(super) fn draw(plot: &Plot, style: &TextStyle) -> String {
                     canvas.curve(curve, colour_of(curve, first_curve + index));
                 }
                 canvas.gaps(&plot.gaps);
-                canvas.write(&style, &mut out);
+                canvas.write(pane, &style, &mut out);
             }
             Content::Bars(bars) => {
                 let mut canvas = Canvas::new(&style, span, vertical_range(pane));
                 for bar in bars {
                     canvas.bar(bar.from, bar.to, bar.count as f64);
                 }
-                canvas.write(&style, &mut out);
+                canvas.write(pane, &style, &mut out);
             }
         }
         first_curve += pane.content.curves().len();
@@ -77,9 +77,9 @@ pub(super) fn draw(plot: &Plot, style: &TextStyle) -> String {
 
 fn legend(pane: &Pane, first_curve: usize, style: &TextStyle, out: &mut String) {
     let mark = if style.unicode { "━━" } else { "--" };
-    let label: String = pane.label.chars().take(AXIS_WIDTH - 1).collect();
+    let label = &pane.label;
     let _ = write!(out, "{label:>width$} ", width = AXIS_WIDTH - 1);
-    let mut used = AXIS_WIDTH;
+    let mut used = AXIS_WIDTH.max(label.chars().count() + 1);
     for (index, curve) in pane.content.curves().iter().enumerate() {
         let needed = curve.name.chars().count() + 5;
         if used > AXIS_WIDTH && used + needed > style.width {
@@ -204,11 +204,10 @@ impl Canvas {
         }
     }
 
-    fn write(&self, style: &TextStyle, out: &mut String) {
-        let (ticks, step) = scale::ticks(self.y, (self.rows / 3).max(1));
+    fn write(&self, pane: &Pane, style: &TextStyle, out: &mut String) {
         let mut labels = vec![String::new(); self.rows];
-        for tick in ticks {
-            labels[(self.dot_y(tick) / 4) as usize] = scale::label(tick, step);
+        for (tick, label) in pane.ticks(self.y, (self.rows / 3).max(1)) {
+            labels[(self.dot_y(tick) / 4) as usize] = label.chars().take(AXIS_WIDTH - 1).collect();
         }
         let border = if style.unicode { ['│', '┤'] } else { ['|', '+'] };
         for (row, label) in labels.iter().enumerate() {

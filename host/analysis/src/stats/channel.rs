@@ -62,6 +62,10 @@ pub struct ChannelStatistics {
     latest_frame_ns: Option<i64>,
     /// Time between frames, where it went forward.
     covered_ns: u64,
+    /// What every interval between two frames is a multiple of; 0 before the first.
+    step_ns: u64,
+    /// Frames with the stamp of the frame before.
+    shared_stamps: u64,
 }
 
 /// Errors that a channel's controller saw.
@@ -153,6 +157,8 @@ impl ChannelStatistics {
             first_bits: 0,
             latest_frame_ns: None,
             covered_ns: 0,
+            step_ns: 0,
+            shared_stamps: 0,
         }
     }
 
@@ -235,6 +241,14 @@ impl ChannelStatistics {
         }
         let (first, last) = self.span_ns.unwrap_or((end_ns, end_ns));
         let interval = self.latest_frame_ns.map_or(0, |before| end_ns.saturating_sub(before));
+        if self.latest_frame_ns.is_some() {
+            self.shared_stamps += u64::from(interval == 0);
+            // Soon it divides every interval, and one division is all that this costs.
+            let step = interval.unsigned_abs();
+            if self.step_ns == 0 || !step.is_multiple_of(self.step_ns) {
+                self.step_ns = common_divisor(self.step_ns, step);
+            }
+        }
         self.latest_frame_ns = Some(end_ns);
         self.covered_ns = self.covered_ns.saturating_add(interval.max(0) as u64);
         self.span_ns = Some((first.min(end_ns), last.max(end_ns)));
@@ -301,6 +315,17 @@ impl ChannelStatistics {
         self.first_bits
     }
 
+    /// What all stamps are multiples of, in nanoseconds, where that is coarser than the frames: many of them share a stamp,
+    /// which on a bus they cannot.
+    pub fn coarse_step_ns(&self) -> Option<u64> {
+        /// Frames that share a stamp, of a hundred: some do where two of a USB packet are stamped on arrival.
+        const SHARED_PCT: u64 = 10;
+        /// Nothing shorter hides a frame's length.
+        const FINE_NS: u64 = 100_000;
+        let many = self.shared_stamps * 100 >= self.frames * SHARED_PCT && self.shared_stamps > 1;
+        (many && self.step_ns >= FINE_NS).then_some(self.step_ns)
+    }
+
     /// Frames per second from the first to the last: intervals over time.
     pub fn frames_per_s(&self) -> f64 {
         per_second(self.frames.saturating_sub(1), self.covered_ns)
@@ -346,4 +371,12 @@ impl ChannelStatistics {
     pub fn unlisted_frames(&self) -> u64 {
         self.ids.unlisted_frames
     }
+}
+
+/// The greatest common divisor; of 0 and a number, the number.
+fn common_divisor(mut a: u64, mut b: u64) -> u64 {
+    while b != 0 {
+        (a, b) = (b, a % b);
+    }
+    a
 }

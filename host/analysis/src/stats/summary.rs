@@ -18,7 +18,13 @@ pub struct Summary {
     pub first_s: Option<f64>,
     /// End of its last frame.
     pub last_s: Option<f64>,
-    /// Between the two, in seconds.
+    /// As [`Self::first_s`], to the nanosecond.
+    pub first_ns: Option<i64>,
+    /// As [`Self::last_s`], to the nanosecond.
+    pub last_ns: Option<i64>,
+    /// Where the trace's windows begin: its first record, be it a frame or not.
+    pub origin_s: Option<f64>,
+    /// Between the first and the last frame, in seconds.
     pub duration_s: f64,
     /// Length of a window, in seconds.
     pub window_s: f64,
@@ -55,6 +61,8 @@ pub struct ChannelSummary {
     pub late: u64,
     /// Records that are older than the record before.
     pub out_of_order: u64,
+    /// What all stamps are multiples of, in seconds, if that is coarser than the frames: no period or window below it says anything.
+    pub stamp_step_s: Option<f64>,
     /// End of the first frame, in seconds.
     pub first_s: Option<f64>,
     /// End of the last frame, in seconds.
@@ -199,14 +207,18 @@ pub struct IdSummary {
     pub share_pct: f64,
 }
 
-/// Nanoseconds as seconds.
+/// Nanoseconds as seconds, rounded once: a float has no room for the nanoseconds since 1970.
 fn seconds(ns: i64) -> f64 {
-    ns as f64 / 1e9
+    (ns / 1_000_000_000) as f64 + (ns % 1_000_000_000) as f64 / 1e9
 }
 
 impl Summary {
     pub(super) fn of(statistics: &Statistics) -> Self {
-        let mut channels: Vec<_> = statistics.channels().iter().map(ChannelSummary::of).collect();
+        let mut channels: Vec<_> = statistics
+            .channels()
+            .iter()
+            .map(|channel| ChannelSummary::of(channel, statistics.window_ns))
+            .collect();
         channels.sort_by_key(|channel| channel.channel);
         let spans = || statistics.channels().iter().filter_map(|channel| channel.span_ns);
         let first = spans().map(|(first, _)| first).min();
@@ -219,6 +231,9 @@ impl Summary {
             errors: channels.iter().map(|channel| channel.errors.total).sum(),
             first_s: first.map(seconds),
             last_s: last.map(seconds),
+            first_ns: first,
+            last_ns: last,
+            origin_s: statistics.first_ns.map(seconds),
             duration_s: longest,
             window_s: statistics.window_ns as f64 / 1e9,
             channels,
@@ -227,17 +242,20 @@ impl Summary {
 }
 
 impl ChannelSummary {
-    fn of(channel: &ChannelStatistics) -> Self {
+    fn of(channel: &ChannelStatistics, window_ns: u64) -> Self {
         let mut ids: Vec<_> = channel.ids().collect();
         ids.sort_by_key(|id| (id.id.is_extended(), id.id.raw()));
-        let windows = channel.window_least_and_mean_pct();
+        let step_ns = channel.coarse_step_ns();
+        // A window as short as the stamps' step has all of the step's frames, or none.
+        let says_nothing = step_ns.is_some_and(|step| window_ns < step * 2);
+        let windows = channel.window_least_and_mean_pct().filter(|_| !says_nothing);
         let load = channel.load.as_ref().map(|load| LoadSummary {
             instant_pct: load.instant_pct(),
             instant_max_pct: load.instant_max_pct(),
             mean_pct: load.mean_pct(),
             window_min_pct: windows.map(|(least, _)| least),
             window_mean_pct: windows.map(|(_, mean)| mean),
-            window_max_pct: channel.window_largest_pct(),
+            window_max_pct: channel.window_largest_pct().filter(|_| !says_nothing),
         });
         // As for frames: the first frame's bits lie before the span.
         let span = channel.covered_ns();
@@ -256,6 +274,7 @@ impl ChannelSummary {
             esi: channel.esi,
             late: channel.late,
             out_of_order: channel.out_of_order,
+            stamp_step_s: step_ns.map(|step| step as f64 / 1e9),
             first_s: channel.span_ns.map(|(first, _)| seconds(first)),
             last_s: channel.span_ns.map(|(_, last)| seconds(last)),
             duration_s: span as f64 / 1e9,

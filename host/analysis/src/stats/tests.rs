@@ -199,3 +199,43 @@ fn a_channel_of_which_frames_are_not_wholly_known_has_a_bit_rate_and_no_load() {
     let known: Vec<bool> = summary.channels.iter().map(|channel| channel.bus_load_pct.is_some()).collect();
     assert_eq!(known, [true, false]);
 }
+
+/// Whole seconds, as some loggers stamp: 100 frames share each, and of ten windows of a second's tenth nine are empty.
+#[test]
+fn stamps_coarser_than_the_frames_are_noticed() {
+    let of = |window: Duration, step_us: i64| {
+        let options = Options { bitrate_bps: Some(500_000), window, ..Options::default() };
+        let mut statistics = Statistics::new(options).unwrap();
+        for n in 0..1000i64 {
+            statistics.push(&frame(n * 10_000 / step_us * step_us, 1, "123#1122334455667788"));
+        }
+        statistics.summary().channels.remove(0)
+    };
+    let tenths = of(Duration::from_millis(100), 1_000_000);
+    assert_eq!(tenths.stamp_step_s, Some(1.0));
+    let load = tenths.load.unwrap();
+    assert_eq!((load.window_min_pct, load.window_mean_pct, load.window_max_pct), (None, None, None));
+    // Windows of several steps say what they always say.
+    let longer = of(Duration::from_secs(2), 1_000_000);
+    assert_eq!(longer.stamp_step_s, Some(1.0));
+    assert!(longer.load.unwrap().window_mean_pct.is_some());
+    let fine = of(Duration::from_millis(100), 10_000);
+    assert_eq!(fine.stamp_step_s, None);
+    assert!(fine.load.unwrap().window_mean_pct.is_some());
+}
+
+/// Times since 1970 have more digits than a float.
+#[test]
+fn the_first_and_last_time_are_told_to_the_nanosecond() {
+    let mut statistics = at_1_mbit();
+    let first = frame(0, 1, "123#");
+    statistics.push(&TraceRecord { time_ns: 1_800_000_000_123_456_789, ..first });
+    statistics.push(&TraceRecord { time_ns: 1_800_000_001_123_456_788, ..first });
+    let summary = statistics.summary();
+    assert_eq!(
+        (summary.first_ns, summary.last_ns),
+        (Some(1_800_000_000_123_456_789), Some(1_800_000_001_123_456_788))
+    );
+    let nearest: f64 = "1800000000.123456789".parse().unwrap();
+    assert!((summary.first_s.unwrap() - nearest).abs() <= 2.5e-7, "{:?}", summary.first_s);
+}

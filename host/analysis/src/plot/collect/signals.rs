@@ -2,12 +2,14 @@
 
 use std::collections::HashMap;
 
+use super::super::layout::vertical_range;
 use super::super::model::{Content, Curve, PALETTE, Pane, Plot};
 use super::{Gaps, TimeAxis};
+use crate::Cadence;
 use cantap_signals::{Decoder, MessageRef, Signal, SignalValue};
 use cantap_trace::TraceRecord;
 
-/// Curves in one picture; more cannot be told apart.
+/// Curves in one picture, unless more are asked for: they could hardly be told apart.
 pub const MOST_CURVES: usize = 24;
 
 /// Collects the curves of the signals that a decoder has selected.
@@ -19,6 +21,7 @@ pub struct SignalCollector<'a> {
     /// Curve of each signal: channel, message, signal.
     places: HashMap<(u8, MessageRef, u32), usize>,
     curves: Vec<Collected>,
+    most_curves: usize,
     left_out: u64,
     values: Vec<SignalValue>,
 }
@@ -30,6 +33,7 @@ struct Collected {
     curve: Curve,
     digital: bool,
     state: bool,
+    cadence: Cadence,
 }
 
 impl<'a> SignalCollector<'a> {
@@ -42,9 +46,16 @@ impl<'a> SignalCollector<'a> {
             end: 0.0,
             places: HashMap::new(),
             curves: Vec::new(),
+            most_curves: MOST_CURVES,
             left_out: 0,
             values: Vec::new(),
         }
+    }
+
+    /// Draws up to so many curves, in place of [`MOST_CURVES`].
+    #[must_use]
+    pub fn with_most_curves(self, most_curves: usize) -> Self {
+        Self { most_curves, ..self }
     }
 
     /// Takes the next record of the trace.
@@ -62,21 +73,21 @@ impl<'a> SignalCollector<'a> {
         let mut values = std::mem::take(&mut self.values);
         if let Some(message) = self.decoder.decode(record.channel, frame, &mut values) {
             for value in &values {
-                self.value(record.channel, message, value, x);
+                self.value(record, message, value, x);
             }
         }
         self.values = values;
     }
 
-    fn value(&mut self, channel: u8, message: MessageRef, value: &SignalValue, x: f64) {
-        let decoder = self.decoder;
+    fn value(&mut self, record: &TraceRecord, message: MessageRef, value: &SignalValue, x: f64) {
+        let (decoder, channel, most) = (self.decoder, record.channel, self.most_curves);
         let Some(signal) = decoder.message(message).signals.get(value.signal as usize) else {
             return;
         };
         let curves = &mut self.curves;
         let place = match self.places.entry((channel, message, value.signal)) {
             std::collections::hash_map::Entry::Occupied(place) => *place.get(),
-            std::collections::hash_map::Entry::Vacant(_) if curves.len() == MOST_CURVES => {
+            std::collections::hash_map::Entry::Vacant(_) if curves.len() >= most => {
                 self.left_out += 1;
                 return;
             }
@@ -88,12 +99,19 @@ impl<'a> SignalCollector<'a> {
                     curve: curve_of(signal),
                     digital: signal.digital.is_some() || signal.length == 1,
                     state: false,
+                    cadence: Cadence::new(decoder.message(message).cycle_ms),
                 });
                 *vacant.insert(curves.len() - 1)
             }
         };
         let collected = &mut curves[place];
-        let y = if collected.digital {
+        // Nobody knows what it was while it was silent: a line would say so.
+        if collected.cadence.arrive(record.time_ns) {
+            collected.curve.series.interrupt();
+        }
+        let y = if value.value.is_nan() {
+            f64::NAN
+        } else if collected.digital {
             collected.state = match signal.digital {
                 Some(digital) => digital.state(collected.state, value.value),
                 None => value.raw != 0,
@@ -105,7 +123,7 @@ impl<'a> SignalCollector<'a> {
         collected.curve.series.push(x, y);
     }
 
-    /// Values of signals that found no room among [`MOST_CURVES`].
+    /// Values of signals that found no room among the most curves.
     pub fn left_out(&self) -> u64 {
         self.left_out
     }
@@ -143,6 +161,7 @@ impl<'a> SignalCollector<'a> {
                 }),
             }
         }
+        share_scales(&mut panes);
         if !digital.is_empty() {
             panes.push(Pane { label: String::new(), range: None, content: Content::Digital(digital) });
         }
@@ -174,8 +193,33 @@ impl<'a> SignalCollector<'a> {
     }
 }
 
+/// Panes of one unit show the same range, so that their heights compare.
+fn share_scales(panes: &mut [Pane]) {
+    for first in 0..panes.len() {
+        let label = panes[first].label.clone();
+        let same: Vec<_> =
+            (first..panes.len()).filter(|&at| !label.is_empty() && panes[at].label == label).collect();
+        if same.len() < 2 || panes[first].range.is_some() {
+            continue;
+        }
+        let ranges: Vec<_> = same.iter().map(|&at| vertical_range(&panes[at])).collect();
+        let low = ranges.iter().map(|range| range.0).fold(f64::INFINITY, f64::min);
+        let high = ranges.iter().map(|range| range.1).fold(f64::NEG_INFINITY, f64::max);
+        for at in same {
+            panes[at].range = Some((low, high));
+        }
+    }
+}
+
+/// Most values of a table that an axis names.
+const MOST_TEXTS: usize = 64;
+
 fn curve_of(signal: &Signal) -> Curve {
+    let texts = signal.values.iter().take(MOST_TEXTS);
+    let value = |raw: i64| raw as f64 * signal.factor + signal.offset;
     Curve {
+        texts: texts.map(|(raw, text)| (value(raw), text.to_owned())).collect(),
+        whole: signal.integer(0).is_some() && signal.factor.fract() == 0.0 && signal.offset.fract() == 0.0,
         colour: signal.colour.map(|colour| [colour.red, colour.green, colour.blue]),
         // A gear or a state has nothing between its values.
         stepped: !signal.values.is_empty() || signal.digital.is_some() || signal.length == 1,
@@ -232,6 +276,45 @@ mod tests {
         // Off, on above the upper threshold, and still on between the two.
         let states: Vec<_> = digital[0].series.points().iter().map(|point| point.y).collect();
         assert_eq!(states, [0.0, 1.0, 1.0]);
+    }
+
+    /// Twenty-five minutes without a frame are not a straight line.
+    #[test]
+    fn silence_interrupts_a_curve() {
+        let decoder = decoder();
+        let mut collector = SignalCollector::new(&decoder);
+        for time in (0..10).map(|n| n * 100).chain((0..10).map(|n| 1_500_000 + n * 100)) {
+            collector.push(&frame(time, &format!("123#{:02X}", time / 100 % 200)));
+        }
+        let plot = collector.finish(String::new());
+        let points = plot.panes[0].content.curves()[0].series.points();
+        let breaks: Vec<_> = points.iter().filter(|point| point.y.is_nan()).map(|point| point.x).collect();
+        assert_eq!(breaks, [0.9]);
+    }
+
+    #[test]
+    fn many_curves_of_a_unit_share_their_scale_and_as_many_as_wanted_are_drawn() {
+        let signals: Vec<_> = (0..8)
+            .map(|n| Signal { unit: "V".to_owned(), ..Signal::new(format!("Cell{n}"), n * 8, 8) })
+            .collect();
+        let message = Message {
+            signals,
+            length: 8,
+            ..decoder().message(decoder().signals().next().unwrap().0).clone()
+        };
+        let database = Database { messages: vec![message], ..Database::default() };
+        let decoder = Decoder::new(vec![Source { channel: None, database }]);
+        let mut collector = SignalCollector::new(&decoder);
+        for (time, text) in [(0, "123#00.01.02.03.04.05.06.C8"), (10, "123#01.02.03.04.05.06.07.C9")] {
+            collector.push(&frame(time, text));
+        }
+        let plot = collector.finish(String::new());
+        assert_eq!(plot.panes.len(), 2);
+        assert_eq!(plot.panes[0].range, plot.panes[1].range);
+        assert!(plot.panes[0].range.is_some_and(|(low, high)| low <= 0.0 && high >= 201.0));
+        let mut few = SignalCollector::new(&decoder).with_most_curves(3);
+        few.push(&frame(0, "123#0001020304050607"));
+        assert_eq!((few.left_out(), few.finish(String::new()).panes[0].content.curves().len()), (5, 3));
     }
 
     #[test]

@@ -1,0 +1,124 @@
+//! KCD, SYM and ARXML files: what is in them, and what is said where something is wrong. That they decode as elsewhere is for
+//! `signals_agree_with_cantools.rs`.
+
+use cantap_signals::{Database, DatabaseError, Decoder, Source, arxml, kcd, sym};
+use cantap_trace::TraceFrame;
+
+fn decode(database: Database, frame: &str) -> String {
+    let decoder = Decoder::new(vec![Source { channel: None, database }]);
+    let frame: TraceFrame = frame.parse().unwrap();
+    let mut values = Vec::new();
+    let message = decoder.message(decoder.decode(1, &frame, &mut values).unwrap());
+    let texts = values.iter().map(|value| {
+        let signal = &message.signals[value.signal as usize];
+        let text = signal.text(value.raw).map(|text| format!("({text})")).unwrap_or_default();
+        format!("{}={}{text}{}", signal.name, signal.number(value.raw), signal.unit)
+    });
+    texts.collect::<Vec<_>>().join(" ")
+}
+
+const KCD: &str = r#"<NetworkDefinition xmlns="http://kayak.2codeornot2code.org/1.0"><Document name="x"/>
+ <Bus name="Motor">
+  <Message id="0x0B2" name="ABS" interval="100" length="4"><Notes>Brakes</Notes>
+   <Multiplex name="Mux" offset="0" length="2"><MuxGroup count="1"><Signal name="One" offset="8" length="8"/></MuxGroup>
+    <MuxGroup count="2"><Signal name="Two" offset="8" length="8"><Value slope="0.1" unit="V"/></Signal></MuxGroup></Multiplex>
+   <Signal name="Big" offset="16" length="12" endianess="big"><Value type="signed" intercept="-1"/>
+    <LabelSet><Label name="none" value="0"/><LabelGroup name="some" from="1" to="3"/></LabelSet></Signal>
+  </Message>
+  <Message id="0x900" name="Far"/>
+ </Bus></NetworkDefinition>"#;
+
+#[test]
+fn a_kcd_file_is_read() {
+    let database = kcd::parse("x.kcd", KCD.as_bytes()).unwrap();
+    assert_eq!((database.messages.len(), database.messages[0].cycle_ms), (1, Some(100)));
+    assert_eq!(database.messages[0].description, "Brakes");
+    let warnings: Vec<_> = database.warnings.iter().map(ToString::to_string).collect();
+    assert!(warnings.len() == 1 && warnings[0].starts_with("line 9: Far: identifier 0x900"), "{warnings:?}");
+    assert_eq!(decode(database.clone(), "0B2#02070020"), "Mux=2 Big=1(some) Two=0.7V");
+    assert_eq!(decode(database, "0B2#0107FFF0"), "Mux=1 Big=-2 One=7");
+}
+
+const SYM: &str = "FormatVersion=6.0 // Do not edit this line!\nTitle=\"x\"\n\n{ENUMS}\nEnum=Gear(0=\"Park\", // a comment\n  1=\"Drive\")\n\n\
+                   {SIGNALS}\nSig=\"A B\" unsigned 8 -m /u:\"m s\" /f:0.5 /o:-1 // speed\n\n{SENDRECEIVE}\n\n[\"Sym\"]\nID=00000123h-00000124h // two\n\
+                   Len=4\nCycleTime=20\nMux=First 0,8 1Ah -m\nSig=\"A B\" 8\n\n[\"Sym\"]\nLen=4\nMux=Second 0,8 1Bh -m\nVar=G Gear 8,4\n\n\
+                   [Bad]\nID=5h\nSig=Nowhere 3\n";
+
+#[test]
+fn a_sym_file_is_read() {
+    let database = sym::parse("x.sym", SYM.as_bytes()).unwrap();
+    let names: Vec<_> =
+        database.messages.iter().map(|message| (message.id.to_string(), message.cycle_ms)).collect();
+    assert_eq!(names, [("00000123".to_owned(), Some(20)), ("00000124".to_owned(), Some(20))]);
+    let warnings: Vec<_> = database.warnings.iter().map(ToString::to_string).collect();
+    assert!(warnings[0].starts_with("line 27: Bad: there is no signal \"Nowhere\""), "{warnings:?}");
+    assert_eq!(decode(database.clone(), "00000124#1A05"), "First=26 A B=1.5m s");
+    assert_eq!(decode(database, "00000123#1B01"), "First=27 G=1(Drive)");
+}
+
+const ARXML: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
+<AUTOSAR xmlns="http://autosar.org/schema/r4.0"><AR-PACKAGES><AR-PACKAGE><SHORT-NAME>P</SHORT-NAME><ELEMENTS>
+ <CAN-CLUSTER><SHORT-NAME>C</SHORT-NAME><X><CAN-FRAME-TRIGGERING><SHORT-NAME>T</SHORT-NAME><FRAME-REF>/P/F</FRAME-REF>
+  <CAN-ADDRESSING-MODE>EXTENDED</CAN-ADDRESSING-MODE><IDENTIFIER>291</IDENTIFIER></CAN-FRAME-TRIGGERING>
+  <CAN-FRAME-TRIGGERING><SHORT-NAME>U</SHORT-NAME><FRAME-REF>/P/Gone</FRAME-REF><IDENTIFIER>5</IDENTIFIER></CAN-FRAME-TRIGGERING></X></CAN-CLUSTER>
+ <CAN-FRAME><SHORT-NAME>F</SHORT-NAME><FRAME-LENGTH>3</FRAME-LENGTH><M><PDU-TO-FRAME-MAPPING><SHORT-NAME>PM</SHORT-NAME><PDU-REF>/P/Pdu</PDU-REF>
+  <START-POSITION>8</START-POSITION></PDU-TO-FRAME-MAPPING></M></CAN-FRAME>
+ <I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME><T><TIME-PERIOD><VALUE>0.25</VALUE></TIME-PERIOD></T>
+  <S><I-SIGNAL-TO-I-PDU-MAPPING><SHORT-NAME>SM</SHORT-NAME><I-SIGNAL-REF>/P/Sig</I-SIGNAL-REF>
+  <PACKING-BYTE-ORDER>MOST-SIGNIFICANT-BYTE-FIRST</PACKING-BYTE-ORDER><START-POSITION>7</START-POSITION></I-SIGNAL-TO-I-PDU-MAPPING></S></I-SIGNAL-I-PDU>
+ <I-SIGNAL><SHORT-NAME>Sig</SHORT-NAME><DESC><L-2 L="EN">Outside</L-2></DESC><LENGTH>16</LENGTH><N><C><BASE-TYPE-REF>/P/S16</BASE-TYPE-REF><COMPU-METHOD-REF>/P/CM</COMPU-METHOD-REF></C></N></I-SIGNAL>
+ <SW-BASE-TYPE><SHORT-NAME>S16</SHORT-NAME><BASE-TYPE-ENCODING>2C</BASE-TYPE-ENCODING></SW-BASE-TYPE>
+ <COMPU-METHOD><SHORT-NAME>CM</SHORT-NAME><UNIT-REF>/P/Celsius</UNIT-REF><I><COMPU-SCALES>
+  <COMPU-SCALE><LOWER-LIMIT>-400</LOWER-LIMIT><UPPER-LIMIT>850</UPPER-LIMIT><COMPU-RATIONAL-COEFFS><COMPU-NUMERATOR><V>5</V><V>1</V></COMPU-NUMERATOR><COMPU-DENOMINATOR><V>10</V></COMPU-DENOMINATOR></COMPU-RATIONAL-COEFFS></COMPU-SCALE>
+  <COMPU-SCALE><LOWER-LIMIT>32767</LOWER-LIMIT><UPPER-LIMIT>32767</UPPER-LIMIT><COMPU-CONST><VT>Broken</VT></COMPU-CONST></COMPU-SCALE></COMPU-SCALES></I></COMPU-METHOD>
+ <UNIT><SHORT-NAME>Celsius</SHORT-NAME><DISPLAY-NAME>°C</DISPLAY-NAME></UNIT>
+</ELEMENTS></AR-PACKAGE></AR-PACKAGES></AUTOSAR>"#;
+
+#[test]
+fn an_arxml_file_is_read() {
+    let database = arxml::parse("x.arxml", ARXML.as_bytes()).unwrap();
+    let message = &database.messages[0];
+    assert_eq!((database.messages.len(), message.name.as_str(), message.cycle_ms), (1, "F", Some(250)));
+    let signal = &message.signals[0];
+    assert_eq!((signal.min, signal.max, signal.description.as_str()), (Some(-39.5), Some(85.5), "Outside"));
+    let warnings: Vec<_> = database.warnings.iter().map(ToString::to_string).collect();
+    assert!(warnings[0].contains("U: the frame \"/P/Gone\" is not in the file"), "{warnings:?}");
+    assert_eq!(decode(database.clone(), "00000123#00FFF6"), "Sig=-0.5°C");
+    assert_eq!(decode(database, "00000123#007FFF"), "Sig=3277.2(Broken)°C");
+    // UTF-16, as some tools write.
+    let wide: Vec<u8> =
+        std::iter::once(0xFEFF).chain(ARXML.encode_utf16()).flat_map(u16::to_le_bytes).collect();
+    assert_eq!(arxml::parse("x.arxml", &wide).unwrap().messages[0].signals[0].unit, "°C");
+}
+
+type Parse = fn(&str, &[u8]) -> Result<Database, DatabaseError>;
+
+#[test]
+fn what_is_no_database_is_an_error() {
+    for (parse, text, expected) in [
+        (kcd::parse as Parse, "", "x: the file is empty"),
+        (kcd::parse, "<a>", "x: line 1: "),
+        (kcd::parse, "<AUTOSAR/>", "x: its element is <AUTOSAR>; a KCD file's is <NetworkDefinition>"),
+        (sym::parse, " \n", "x: the file is empty"),
+        (sym::parse, "[A]\nID=1h\n", "x: there is no line FormatVersion="),
+        (arxml::parse, "", "x: the file is empty"),
+        (arxml::parse, "<AUTOSAR/>", "x: no CAN frame is in it"),
+        (arxml::parse, "<html/>", "x: its element is <html>; an ARXML file's is <AUTOSAR>"),
+    ] {
+        let error = parse("x", text.as_bytes()).unwrap_err().to_string();
+        assert!(error.starts_with(expected), "{text:?}: {error}");
+    }
+}
+
+/// Cut anywhere, a file is an error or a smaller database, and never the end of the program.
+#[test]
+fn files_cut_anywhere_are_read_or_refused() {
+    for (parse, text) in [(kcd::parse as Parse, KCD), (sym::parse, SYM), (arxml::parse, ARXML)] {
+        for end in (0..text.len()).step_by(7) {
+            let _ = parse("x", &text.as_bytes()[..end]);
+            let mut damaged = text.as_bytes().to_vec();
+            damaged[end] = b'9';
+            let _ = parse("x", &damaged);
+        }
+    }
+}

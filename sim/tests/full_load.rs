@@ -15,11 +15,11 @@ use cantap_wire::Channel;
 use cantap_wire::message::ChannelConfig;
 
 /// Runs the firmware; the law of counting must hold.
-fn capture(options: &Options) -> Option<Report> {
-    let (report, _) = run(common::firmware()?, options).unwrap();
+fn capture(options: &Options) -> Report {
+    let (report, _) = run(common::firmware(), options).unwrap();
     println!("{}", report.to_json());
     assert!(report.ok, "{:?}", report.faults);
-    Some(report)
+    report
 }
 
 fn at_full_load(kind: Kind, seconds: f64) -> Options {
@@ -29,7 +29,7 @@ fn at_full_load(kind: Kind, seconds: f64) -> Options {
 
 /// Both channels at full load lose nothing, and stamps are at most 0.6 us late; with a core that waits as long as it can, 1.
 fn nothing_is_lost(options: &Options, least_frames_per_s: f64) {
-    let Some(report) = capture(options) else { return };
+    let report = capture(options);
     assert_eq!(report.channels.len(), 2);
     for channel in &report.channels {
         assert_eq!((channel.delivered, channel.lost.total()), (channel.sent, 0));
@@ -41,12 +41,14 @@ fn nothing_is_lost(options: &Options, least_frames_per_s: f64) {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Std0, 2.0), 20_800.0);
 }
 
 /// The same with everything as slow as the manuals allow.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_shortest_frames_lose_nothing_at_worst() {
     for (kind, least_frames_per_s) in [(Kind::Std0, 20_800.0), (Kind::Rtr, 21_250.0)] {
         nothing_is_lost(&Options { bound: Bound::Worst, ..at_full_load(kind, 0.2) }, least_frames_per_s);
@@ -54,21 +56,25 @@ fn the_shortest_frames_lose_nothing_at_worst() {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn remote_frames_of_47_bits_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Rtr, 0.3), 21_250.0);
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn extended_frames_with_eight_bytes_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Ext8, 0.5), 6_200.0);
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn standard_frames_with_eight_bytes_lose_nothing() {
     nothing_is_lost(&at_full_load(Kind::Std8, 0.3), 7_400.0);
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_mix_of_everything_loses_nothing() {
     nothing_is_lost(&at_full_load(Kind::Mix, 0.5), 8_000.0);
 }
@@ -76,6 +82,7 @@ fn a_mix_of_everything_loses_nothing() {
 /// The earlier analyser's table of the load it could carry without loss, 7.7 to 12.8 % over RS-232. Ours: all of it, on
 /// two channels. "No stamp" is what its users could leave out to save bandwidth.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
     const MEGABIT: u32 = 1_000_000;
     for (kind, omit_stamps) in [
@@ -86,7 +93,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
         (Kind::Ext0, false),
         (Kind::Ext8, false),
     ] {
-        let Some(image) = common::firmware() else { return };
+        let image = common::firmware();
         let mut rig = Rig::new(image, common::setup(), Timing::hasty(CLOCK));
         rig.connect().unwrap();
         let listen = ChannelConfig::listen_only(timing(MEGABIT).unwrap());
@@ -113,6 +120,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
 
 /// The queue holds 96 KiB: at 5 bytes and 48 us for each frame of the worst kind on one channel, 0.9 s.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
     for millis in [100, 300, 600] {
         let options = Options {
@@ -120,7 +128,7 @@ fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
             channels: vec![Channel::Can1],
             ..at_full_load(Kind::Std0, millis as f64 / 1000.0 + 0.15)
         };
-        let Some(report) = capture(&options) else { return };
+        let report = capture(&options);
         assert_eq!(report.channels[0].lost.total(), 0);
         assert!(report.queue_high_water_bytes <= report.queue_bytes);
         // What the stall left in the queue, less what the last moment before it flushed.
@@ -130,9 +138,10 @@ fn a_host_that_stalls_for_100_300_or_600_ms_costs_nothing_on_one_channel() {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
     let options = Options { stall: Some(Duration::from_millis(700)), ..at_full_load(Kind::Std0, 0.9) };
-    let Some(report) = capture(&options) else { return };
+    let report = capture(&options);
     for channel in &report.channels {
         assert!(channel.lost.queue > 1000, "{channel:?}");
         assert_eq!((channel.lost.controller, channel.lost.link), (0, 0));
@@ -142,13 +151,14 @@ fn a_stall_beyond_the_queue_loses_frames_and_counts_every_one() {
 
 /// One channel fills the queue in 0.94 s.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_stall_of_more_than_a_second_on_one_channel_loses_what_does_not_fit_and_counts_it() {
     let options = Options {
         stall: Some(Duration::from_millis(1200)),
         channels: vec![Channel::Can1],
         ..at_full_load(Kind::Std0, 1.4)
     };
-    let Some(report) = capture(&options) else { return };
+    let report = capture(&options);
     let channel = &report.channels[0];
     // A quarter of a second of frames, 48 us each.
     assert!((4_500..7_500).contains(&channel.lost.queue), "{channel:?}");
@@ -159,20 +169,22 @@ fn a_stall_of_more_than_a_second_on_one_channel_loses_what_does_not_fit_and_coun
 
 /// 2 packets of 64 bytes in a frame are 128 kB/s; two channels of this kind make 230 kB/s.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_host_that_is_too_slow_fills_the_queue_and_then_catches_up() {
     let mut options = at_full_load(Kind::Ext8, 0.6);
     options.timing.packets_per_frame = 2;
-    let Some(report) = capture(&options) else { return };
+    let report = capture(&options);
     assert!(report.queue_high_water_bytes > 40_000, "{report:?}");
     assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
 }
 
 /// Behind a high-speed hub a packet in every second microframe is 256 kB/s: both channels full of the shortest frames make 215.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_host_behind_a_high_speed_hub_carries_both_channels() {
     let mut options = at_full_load(Kind::Std0, 0.3);
     options.timing = options.timing.behind_hub(2);
-    let Some(report) = capture(&options) else { return };
+    let report = capture(&options);
     assert!(report.channels.iter().all(|channel| channel.lost.total() == 0), "{report:?}");
     // What a host without a hub leaves in the queue is a batch; a queue that only fills would have 25 kB at 130 kB/s.
     assert!(report.queue_high_water_bytes < 10_000, "{report:?}");
@@ -180,15 +192,16 @@ fn a_host_behind_a_high_speed_hub_carries_both_channels() {
 
 /// The same seed gives the same run, another seed another.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_run_depends_on_its_seed_only() {
     let figures = |seed| {
         let options = Options { seed, ..at_full_load(Kind::Mix, 0.05) };
-        let report = capture(&options)?;
+        let report = capture(&options);
         let mut json = report.to_json();
         json["host_s_per_emulated_s"] = 0.into();
-        Some(json)
+        json
     };
-    let Some(first) = figures(7) else { return };
-    assert_eq!(Some(&first), figures(7).as_ref());
-    assert_ne!(Some(first), figures(8));
+    let first = figures(7);
+    assert_eq!(first, figures(7));
+    assert_ne!(first, figures(8));
 }

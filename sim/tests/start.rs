@@ -34,16 +34,17 @@ fn behind_the_bootloader(hz: u64) -> Setup {
 }
 
 /// A rig whose firmware is up and greeted, or none without a firmware.
-fn connected(name: &str, setup: Setup) -> Option<Rig> {
-    let mut rig = Rig::new(common::board(name)?, setup, Timing::hasty(CLOCK));
+fn connected(name: &str, setup: Setup) -> Rig {
+    let mut rig = Rig::new(common::board(name), setup, Timing::hasty(CLOCK));
     rig.connect().unwrap_or_else(|error| panic!("{name}: {error}"));
-    Some(rig)
+    rig
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn every_board_starts_behind_the_rom_bootloader() {
     for (name, hz, _) in BOARDS {
-        let Some(rig) = connected(name, behind_the_bootloader(hz)) else { return };
+        let rig = connected(name, behind_the_bootloader(hz));
         let board = rig.machine.board();
         let clocks = board.rcc.clocks();
         assert_eq!((clocks.sysclk_hz, clocks.pclk1_hz, clocks.usb_hz), (144_000_000, 36_000_000, 48_000_000));
@@ -54,8 +55,9 @@ fn every_board_starts_behind_the_rom_bootloader() {
 
 /// A host must see the bootloader's device go, or it goes on talking to it.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_bootloaders_usb_device_goes_before_ours_comes() {
-    let Some(image) = common::firmware() else { return };
+    let image = common::firmware();
     let mut rig = Rig::new(image, behind_the_bootloader(8_000_000), Timing::hasty(CLOCK));
     rig.with_host(|host, _| host.plug());
     rig.machine.run_until(1).unwrap();
@@ -74,17 +76,19 @@ fn the_bootloaders_usb_device_goes_before_ours_comes() {
 
 /// The bootloader leaves the flash interface open, with errors that nobody has cleared.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn defaults_are_saved_behind_the_bootloader() {
     save_defaults(behind_the_bootloader(8_000_000), |_| {});
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn defaults_are_saved_whatever_error_the_flash_shows() {
     save_defaults(board::setup(), |rig| rig.machine.board().leave_flash_error());
 }
 
 fn save_defaults(setup: Setup, before: fn(&mut Rig)) {
-    let Some(mut rig) = connected("olimex-p405", setup) else { return };
+    let mut rig = connected("olimex-p405", setup);
     for (channel, bitrate_bps) in [(Channel::Can1, 125_000), (Channel::Can2, 500_000)] {
         before(&mut rig);
         let config = ChannelConfig::listen_only(cantap_sim::rig::timing(bitrate_bps).unwrap());
@@ -96,8 +100,9 @@ fn save_defaults(setup: Setup, before: fn(&mut Rig)) {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_rom_bootloader_finds_its_memory_at_zero_and_its_vectors_there() {
-    let Some(mut rig) = connected("olimex-p405", board::setup()) else { return };
+    let mut rig = connected("olimex-p405", board::setup());
     rig.ask(Command::Bootloader).unwrap();
     let Err(RigError::Stopped(stopped)) = rig.run_for(100 * MS) else { panic!("it goes on") };
     assert_eq!(stopped.reason, Reason::Bootloader);
@@ -135,10 +140,11 @@ fn a_peripheral_is_there_only_some_cycles_after_its_clock_was_switched_on() {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
     for (name, hz, pins) in BOARDS {
         let setup = Setup { crystal: crystal(hz), ..board::setup() };
-        let Some(mut rig) = connected(name, setup) else { return };
+        let mut rig = connected(name, setup);
         rig.run_for(MS).unwrap();
         for (port, pin) in pins {
             let board = rig.machine.board();
@@ -151,21 +157,24 @@ fn edges_of_the_can_tx_pins_are_fast_on_every_board() {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_debugger_keeps_its_connection_while_the_processor_sleeps() {
-    let Some(rig) = connected("olimex-p405", board::setup()) else { return };
+    let rig = connected("olimex-p405", board::setup());
     assert_eq!(rig.machine.board().debug_control() & 1, 1);
 }
 
 /// The firmware waits 100 ms of HSI; the emulator's time passes at 144 MHz, where those cycles are 15.
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_crystal_that_is_slow_is_waited_for() {
     let slow = Crystal { hz: 8_000_000, start_us: Some(5 * CRYSTAL_START_US) };
     connected("olimex-p405", Setup { crystal: slow, ..board::setup() });
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_crystal_that_does_not_start_is_told_by_the_led_and_tried_again() {
-    let Some(image) = common::firmware() else { return };
+    let image = common::firmware();
     let broken = Crystal { hz: 8_000_000, start_us: None };
     let mut rig = Rig::new(image, Setup { crystal: broken, ..board::setup() }, Timing::hasty(CLOCK));
     // A millisecond of the firmware, which runs from HSI: 16 000 cycles, which its waiting loop makes a third more here.
@@ -229,9 +238,10 @@ fn fail_once(rig: &mut Rig, target: u32) {
 }
 
 #[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_last_failure_outlives_the_restart_and_can_be_asked_for() {
     let setup = Setup { survive_failures: true, survive_watchdog: true, ..board::setup() };
-    let Some(mut rig) = connected("olimex-p405", setup) else { return };
+    let mut rig = connected("olimex-p405", setup);
     assert_eq!(failures(&mut rig), Failures::default());
 
     // A panic, as an index beyond its slice in line 7 of `src/a.rs` calls it: index, length and place in registers.

@@ -9,11 +9,9 @@ use cantap_emu::timing::Bound;
 use cantap_sim::board;
 use cantap_sim::firmware;
 
-/// The default board's ELF: `CANTAP_FIRMWARE_ELF`, or where `cargo xtask firmware` puts it. Without either, says
-/// so loudly and returns nothing, and the test has shown nothing.
-pub fn firmware() -> Option<Image> {
-    let path = elf()?;
-    Some(firmware::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+/// The default board's firmware.
+pub fn firmware() -> Image {
+    open(&elf())
 }
 
 /// A board's name, its crystal's frequency in Hz, and where each channel's TX is: port (0 is A) and pin.
@@ -26,27 +24,21 @@ pub const BOARDS: [BoardFacts; 3] = [
     ("stm32f4-discovery", 8_000_000, [(3, 1), (1, 13)]),
 ];
 
-/// A board's ELF, which lies beside the default board's.
-pub fn board(name: &str) -> Option<Image> {
-    let path = elf()?.with_file_name(format!("cantap-{name}.elf"));
-    if !path.exists() {
-        eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware --all` first", path.display());
-        return None;
-    }
-    Some(firmware::open(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display())))
+/// A board's firmware, which lies beside the default board's.
+pub fn board(name: &str) -> Image {
+    open(&elf().with_file_name(format!("cantap-{name}.elf")))
 }
 
-/// The ELF's path.
-pub fn elf() -> Option<PathBuf> {
-    if let Some(path) = std::env::var_os("CANTAP_FIRMWARE_ELF") {
-        return Some(PathBuf::from(path));
-    }
-    let built = Path::new(env!("CARGO_MANIFEST_DIR")).join("../target/firmware/cantap-olimex-p405.elf");
-    if built.exists() {
-        return Some(built);
-    }
-    eprintln!("SKIPPED: there is no {}; run `cargo xtask firmware` first", built.display());
-    None
+fn open(path: &Path) -> Image {
+    firmware::open(path).unwrap_or_else(|error| {
+        panic!("{}: {error}; build it with `cargo xtask firmware --all`", path.display())
+    })
+}
+
+/// The ELF's path: `CANTAP_FIRMWARE_ELF`. Without it, the build script has every test that comes here ignored.
+pub fn elf() -> PathBuf {
+    let path = std::env::var_os("CANTAP_FIRMWARE_ELF");
+    path.expect("CANTAP_FIRMWARE_ELF is not set; build the firmware with `cargo xtask firmware`").into()
 }
 
 /// How long memories and buses keep the core waiting in a test that does not choose: `CANTAP_TIMING` (`best` or `worst`), or

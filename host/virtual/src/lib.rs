@@ -31,3 +31,7 @@ pub use options::{BadOption, Options, Pace};
 #[cfg(unix)]
 pub use pty::{Terminal, TerminalError, open_terminal};
 pub use runner::{Connection, VirtualDevice, open, start};
+
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

@@ -23,7 +23,7 @@ pub struct LiveArgs {
     /// Bit rate of the bus in bit/s: 500000, 500k, 1M.
     #[arg(short, long, requires = "device", value_parser = args::bitrate)]
     bitrate: Option<u32>,
-    /// Listen only for so long, as 10, 500ms or 2m.
+    /// Stop listening after this time, as 10, 500ms or 2m.
     #[arg(short, long, requires = "device", value_parser = args::positive_duration)]
     time: Option<Duration>,
 }

@@ -5,7 +5,7 @@ use cantap::device::Counters;
 /// Frames lost at each stage, both channels together.
 #[derive(Clone, Copy, Default, serde::Serialize)]
 pub struct Losses {
-    /// In the controller's FIFO; at least so many.
+    /// In the controller's FIFO: at least this many.
     pub controller: u64,
     /// In the device's queue.
     pub queue: u64,

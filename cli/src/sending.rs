@@ -15,7 +15,7 @@ use cantap::wire::{CHANNELS, Channel};
 use crate::interrupt;
 use crate::rescue::Rescue;
 
-/// How often is looked whether to go on.
+/// How often to check whether to go on.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Frames being sent: counts their ends, prints them as candump would, and notices when none leaves any more.
@@ -64,7 +64,7 @@ impl<'d> Sending<'d> {
         self.stands_still
     }
 
-    /// Whether nothing more is to be sent: it stands still, an error came, or Ctrl-C.
+    /// Whether nothing more is to be sent: frames no longer leave, an error came, or Ctrl-C.
     pub fn has_stopped(&self) -> bool {
         self.stands_still || self.error.is_some() || interrupt::requested()
     }
@@ -147,7 +147,7 @@ impl<'d> Sending<'d> {
         Ok(Outcome { asked, not_sent, overtaken: self.overtaken, is_one_shot: self.failed > 0, cause })
     }
 
-    /// Waits for the rest of a stream, until it stands still or Ctrl-C.
+    /// Waits for the rest of a stream, until frames no longer leave or Ctrl-C.
     pub fn finish(&mut self, stream: &mut Stream<'_>) -> anyhow::Result<()> {
         stream.flush()?;
         while self.goes_on(&stream.take_ended(), stream.oldest_due()) && stream.under_way() > 0 {

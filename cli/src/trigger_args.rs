@@ -17,10 +17,10 @@ pub struct TriggerArgs {
     /// or "error" (see cantap search --help).
     #[arg(long, value_name = "CONDITION")]
     pub trigger: Option<String>,
-    /// Keep also what happened for so long before the condition held.
+    /// Also keep what happened in this time before the condition held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     pre: Duration,
-    /// Keep also what happens for so long after it held.
+    /// Also keep what happens in this time after it held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     post: Duration,
     /// End after the first event.

@@ -24,7 +24,7 @@ pub struct Args {
     /// Which channel: 1 or 2.
     #[arg(short, long, default_value = "1", value_parser = channel_args::channel)]
     channel: Channel,
-    /// Give up after so long without any sign of traffic, but not before each common rate was tried once.
+    /// Give up after this time without any sign of traffic, but not before each common rate was tried once.
     #[arg(short, long, default_value = "10s", value_name = "TIME", value_parser = args::duration)]
     timeout: Duration,
     /// Print one JSON object.

@@ -51,7 +51,7 @@ pub struct Args {
     /// File to write; its suffix picks the format, if --format does not. Without a suffix it is a candump log.
     #[arg(short, long)]
     output: Option<PathBuf>,
-    /// End after so many frames.
+    /// End after this many frames.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// End after this time, as 10, 500ms or 2m.
@@ -248,7 +248,7 @@ impl ChannelSummary {
     }
 }
 
-/// Says what it usually means that channels heard errors and no frame. With a filter, frames may be there all the same.
+/// Says what it usually means that channels heard errors and no frame. With a filter, there may still be frames.
 fn explain_errors(args: &Args, summary: &Summary) {
     let has_errors_only = |channel: &&ChannelSummary| channel.frames == 0 && channel.bus_errors > 0;
     for channel in summary.channels.iter().filter(has_errors_only).filter(|_| args.filter.is_empty()) {

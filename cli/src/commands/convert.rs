@@ -78,7 +78,7 @@ pub struct WriteArgs {
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
     #[arg(long, value_name = "SIZE|TIME")]
     pub rotate: Vec<RotateAt>,
-    /// Keep only so many of these files: the oldest are deleted.
+    /// Keep only this many of these files: the oldest are deleted.
     #[arg(long, value_name = "N", requires = "rotate", value_parser = clap::value_parser!(u32).range(1..))]
     keep: Option<u32>,
     /// What separates the columns of the earlier analyser's CSV.
@@ -150,7 +150,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
-    // What came until an error is kept: the file is finished all the same.
+    // What came until an error is kept: the file is still finished.
     let read = loop {
         match records.next_batch(&mut batch) {
             Ok(true) => {}

@@ -53,7 +53,7 @@ pub struct Args {
 }
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// The capture goes on for so long before and after a stall, at least.
+/// How long the capture goes on before and after a stall, at least.
 const AROUND_STALL: Duration = Duration::from_secs(1);
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 

@@ -22,7 +22,7 @@ pub struct Args {
     a: PathBuf,
     /// The second trace.
     b: PathBuf,
-    /// Mean periods count as changed if they differ by more than so many percent.
+    /// Mean periods count as changed if they differ by more than this many percent.
     #[arg(long, value_name = "PERCENT", default_value_t = 10.0, value_parser = percent)]
     tolerance: f64,
     /// Compare identifiers whatever channel they are on.

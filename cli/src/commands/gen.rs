@@ -59,7 +59,7 @@ pub struct Args {
     /// Data.
     #[arg(short = 'D', long, value_name = "MODE|HEX", default_value = "r", value_parser = data)]
     data: Data,
-    /// End after so many frames.
+    /// End after this many frames.
     #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Frames of a burst: they follow one another at once, and the gap is from burst to burst.

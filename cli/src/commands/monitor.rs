@@ -72,7 +72,7 @@ pub struct Args {
     /// With --once: write the screen to this file as an SVG picture instead, with its colours.
     #[arg(long, value_name = "FILE", requires = "once")]
     svg: Option<PathBuf>,
-    /// With --once: look at a device for so long.
+    /// With --once: how long to watch a device.
     #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
     time: Duration,
     /// With --once: the screen's size.

@@ -44,7 +44,7 @@ pub struct Args {
     open: ChannelArgs,
     #[command(flatten)]
     read: ReadArgs,
-    /// Play so many times, or i for ever.
+    /// Play this many times, or i for ever.
     #[arg(short = 'l', long = "loop", value_name = "N|i", default_value = "1", value_parser = rounds)]
     rounds: Rounds,
     /// Skip pauses that are longer than this.
@@ -59,7 +59,7 @@ pub struct Args {
     /// Play faster (2) or slower (0.5).
     #[arg(long, default_value_t = 1.0, value_parser = speed)]
     speed: f64,
-    /// End after so many frames.
+    /// End after this many frames.
     #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Wait for Enter before the first frame.
@@ -281,7 +281,7 @@ impl Args {
         Ok(Source { input, mapping })
     }
 
-    /// Plays the trace until everything has ended or stands still.
+    /// Plays the trace until everything has ended or frames no longer leave.
     fn play(
         &self,
         source: &Source,

@@ -51,16 +51,16 @@ pub struct Args {
     live: LiveArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
-    /// Show so many records after each one found.
+    /// Show this many records after each one found.
     #[arg(short = 'A', long, value_name = "N")]
     after_context: Option<usize>,
-    /// Show so many records before each one found.
+    /// Show this many records before each one found.
     #[arg(short = 'B', long, value_name = "N")]
     before_context: Option<usize>,
-    /// Show so many records before and after each one found.
+    /// Show this many records before and after each one found.
     #[arg(short = 'C', long, value_name = "N", default_value_t = 0)]
     context: usize,
-    /// Stop after so many were found.
+    /// Stop after this many were found.
     #[arg(short, long, value_name = "N")]
     max_count: Option<u64>,
     /// Print only how many were found.

@@ -51,7 +51,7 @@ pub struct Args {
     /// The device's channel to listen to: 1, 2 or both.
     #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
     channel: args::Channels,
-    /// Listen only for so long.
+    /// Stop listening after this time.
     #[arg(short = 't', long, value_name = "TIME", requires = "device", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.

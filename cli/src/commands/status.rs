@@ -27,7 +27,7 @@ pub struct Args {
     /// Where the device is: a serial port, or virtual.
     #[arg(short, long)]
     device: Address,
-    /// Open the channels for so long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
+    /// Open the channels for this time before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
     #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.
@@ -50,7 +50,7 @@ const LOOK_EVERY: Duration = Duration::from_millis(20);
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.time.is_none() && args.open.is_given() {
         return Err(wrong(
-            "without --time no channel is opened, so how to open it says nothing; add --time to listen for so long before asking",
+            "without --time no channel is opened, so these options have no effect; add --time to listen for a while before asking",
         ));
     }
     interrupt::watch()?;

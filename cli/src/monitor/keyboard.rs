@@ -37,7 +37,7 @@ impl Keyboard {
         Ok(Self { terminal: Box::new(std::fs::File::open("/dev/tty")?) })
     }
 
-    /// Waits for an event, so long at most.
+    /// Waits for an event, at most for this time.
     #[cfg(unix)]
     pub fn wait(&self, most: Duration) -> io::Result<Waited> {
         use rustix::event::{PollFd, PollFlags, Timespec, poll};
@@ -61,7 +61,7 @@ impl Keyboard {
         Ok(Self {})
     }
 
-    /// Waits for an event, so long at most.
+    /// Waits for an event, at most for this time.
     #[cfg(not(unix))]
     #[expect(clippy::unused_self, reason = "there is only one here")]
     pub fn wait(&self, most: Duration) -> io::Result<Waited> {

@@ -144,7 +144,7 @@ impl Stops {
     }
 }
 
-/// Looks for so long (a file: to its end), then gives the screen.
+/// Watches for that time (a file: to its end), then returns the screen.
 pub fn once(
     origin: Origin,
     mut app: App,

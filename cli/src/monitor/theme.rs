@@ -73,7 +73,7 @@ impl Theme {
         Style::new().add_modifier(Modifier::REVERSED)
     }
 
-    /// A byte that changed so long ago, in nanoseconds: it fades.
+    /// The style of a byte by how long ago it changed, in nanoseconds: it fades.
     pub fn changed(self, age_ns: i64) -> Style {
         match age_ns {
             i64::MIN..300_000_000 => self

@@ -26,7 +26,7 @@ const PACKETS_PER_MS: u32 = 16;
 const GS_NS: u128 = 1_000_000_000_000_000_000;
 /// Nanoseconds of a USB frame.
 pub const FRAME_NS: u64 = 1_000_000;
-/// The device's millisecond ticks come so long after the host's frames start, when neither stands in the other's way.
+/// How long after the host's frames start the device's millisecond ticks come, when neither delays the other.
 pub const TICK_PHASE_NS: u64 = 700_000;
 /// The bits of a frame number in a SOF token (USB 2.0, 8.4.3).
 const FRAME_NUMBER: u16 = 0x7FF;
@@ -281,7 +281,7 @@ impl VirtualPort {
         Self { from_host, to_host, open, credit: 0, held: false }
     }
 
-    /// A share of a millisecond has passed: so many of `parts`.
+    /// A share of a millisecond has passed: one of `parts`.
     pub fn allow(&mut self, parts: u32) {
         self.credit = PACKETS_PER_MS.div_ceil(parts);
     }

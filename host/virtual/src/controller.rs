@@ -194,7 +194,7 @@ impl Controller {
         self.last_error = error_code(kind);
         self.interrupts.error = true;
         match self.mode() {
-            // A silent controller's counters stand still.
+            // A silent controller's counters do not change.
             Some(Mode::ListenOnly) | None => {}
             // A passive sender that nobody acknowledges does not count further (ISO 11898-1:2015, 12.1.4.2).
             Some(_) if own && kind == BusErrorKind::Acknowledgment && self.tec >= PASSIVE => {}

@@ -22,7 +22,7 @@ use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
 
 const MS_NS: u64 = 1_000_000;
-/// USB is looked after so many times in a millisecond.
+/// How many times in a millisecond USB is served.
 const USB_POLLS_PER_MS: u32 = 4;
 
 /// What the simulated bus knows and no device can: how many frames a channel really heard.

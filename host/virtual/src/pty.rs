@@ -143,7 +143,7 @@ impl Line {
         }
     }
 
-    /// The program has closed the port: what the device still had for it is nobody's, and the next program's least of all.
+    /// The program has closed the port: what the device still had for it must not reach the next program.
     fn close(&self) {
         if self.dtr.is_up() {
             self.dtr.set(false);

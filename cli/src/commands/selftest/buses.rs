@@ -24,7 +24,7 @@ const LISTENING: Duration = Duration::from_secs(1);
 const FULL_PCT: f64 = 90.0;
 /// What an unacknowledged frame brings the transmit error counter to: there it stays (ISO 11898-1:2015, 12.1.4.2).
 const UNACKNOWLEDGED_TEC: u8 = 128;
-/// Nothing that is waited for takes so long.
+/// The longest wait; everything that is waited for comes sooner.
 const PATIENCE: Duration = Duration::from_secs(3);
 
 type Result = anyhow::Result<Outcome>;

@@ -78,7 +78,7 @@ impl Report {
         report
     }
 
-    /// Does a step. What goes wrong on the way is a failure, and the next step is tried all the same.
+    /// Does a step. What goes wrong on the way is a failure, and the next step is still tried.
     pub fn step(&mut self, name: &str, act: impl FnOnce() -> anyhow::Result<Outcome>) {
         let outcome =
             act().unwrap_or_else(|error| Outcome::Fail(crate::advice::sentence(&error), Value::Null));

@@ -16,9 +16,9 @@ const ROUND_TRIPS: usize = 500;
 /// A crystal and this computer's clock together are never so far apart; a device that runs from its internal oscillator, which
 /// is good for about 1 %, is.
 const MAX_DRIFT_PPM: f64 = 500.0;
-/// A drift is known after so long, from samples that are good enough.
+/// How long it takes to know a drift, from samples that are good enough.
 const CLOCK_PATIENCE: Duration = Duration::from_secs(12);
-/// A firmware that restarts is on the bus again after so long, however slow the computer's USB is.
+/// How long a firmware that restarts takes to be on the bus again, however slow the computer's USB is.
 const RESTART_PATIENCE: Duration = Duration::from_secs(15);
 
 type Result<T = Outcome> = anyhow::Result<T>;

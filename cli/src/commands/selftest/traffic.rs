@@ -11,7 +11,7 @@ use serde_json::{Value, json};
 use crate::interrupt;
 use crate::meter::rounded;
 
-/// Nothing has ended for so long: it stands still.
+/// After this time in which no frame ended, sending is stuck.
 const PATIENCE: Duration = Duration::from_secs(3);
 /// How far a stamp may be from where the frame's exact length puts it, in microseconds.
 pub const STAMP_TOLERANCE_US: f64 = 5.0;

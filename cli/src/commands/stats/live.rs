@@ -12,7 +12,7 @@ use super::windows::Windows;
 use crate::address::Address;
 use crate::live::LiveRecords;
 
-/// A window is closed so long after its end, so that what is still on the way gets into it.
+/// How long after its end a window is closed, so that what is still on the way gets into it.
 const LATENESS_NS: i64 = 1_000_000_000;
 /// Columns of the bar for 100 %.
 const BAR_COLUMNS: usize = 20;

@@ -8,7 +8,7 @@ use cantap::{Direction, Id, TraceEvent, TraceFrame, TraceRecord};
 
 /// Rows there may be; the frames of further identifiers are counted together.
 const MOST_ROWS: usize = 8192;
-/// Share of a new interval in the smoothed period and jitter: one in so many.
+/// Share of a new interval in the smoothed period and jitter: one part in this many.
 const SMOOTHING: f64 = 8.0;
 
 /// One identifier on one channel.

@@ -24,7 +24,7 @@ impl History {
     /// Room for as many records as `bytes` hold, at least a thousand.
     pub fn new(bytes: usize) -> Self {
         let most = (bytes / size_of::<TraceRecord>()).max(1000);
-        // Reserved at once: growing would copy everything, and the display would stand still meanwhile.
+        // Reserved at once: growing would copy everything, and the display would freeze meanwhile.
         let records = VecDeque::with_capacity(most);
         Self { records, most, first: 0, filters: Vec::new(), listed: VecDeque::new(), first_listed: 0 }
     }

@@ -42,7 +42,7 @@ pub enum SourceState {
     Playing {
         /// Delay factor.
         factor: f64,
-        /// Whether it stands still.
+        /// Whether it is paused.
         paused: bool,
         /// Whether it begins anew after its end.
         looped: bool,

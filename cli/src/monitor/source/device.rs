@@ -12,7 +12,7 @@ use super::{FIGURES_EVERY, Order, Plan, Source, Then, WAIT, lock};
 use crate::advice;
 use crate::live::{Line, line};
 
-/// A window is closed so long after its end although nothing came, so that a late frame finds it open.
+/// How long after its end a window is closed when nothing comes, so that a late frame still finds it open.
 const LATENESS_NS: i64 = 1_000_000_000;
 
 impl Source<'_> {
@@ -91,7 +91,7 @@ impl Source<'_> {
 
     /// Ends the session; what was captured until then is shown and recorded.
     fn end(&mut self, line: &mut Line) {
-        // If that fails the device has just gone, and what was ordered counts all the same.
+        // If that fails the device has just gone, and what was ordered still counts.
         let _ = line.stop();
         loop {
             match line.next(WAIT) {
@@ -227,7 +227,7 @@ fn open_as(plan: &Plan) -> Line {
     let Plan { address, channels, open } = plan.clone();
     let mode = plan.mode();
     line(&address, move |device| {
-        // No filters, saved ones neither: what is not shown is recorded all the same.
+        // No filters, not even saved ones: what is not shown is still recorded.
         open.open(device, channels.iter().copied(), mode, None).map(|_| ())
     })
 }

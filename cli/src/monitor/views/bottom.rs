@@ -40,7 +40,7 @@ fn over(frame: &mut Frame<'_>, body: Rect, text: &str) {
     frame.render_widget(Paragraph::new(lines).style(Theme::bar()), place);
 }
 
-/// Lines of at most so many characters; only a word that is longer is cut.
+/// Lines no longer than the width in characters; only a word that is longer is cut.
 fn wrapped(text: &str, width: usize) -> Vec<String> {
     let width = width.max(1);
     let mut lines = vec![String::new()];

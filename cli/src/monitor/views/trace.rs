@@ -31,7 +31,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     }
     app.bottom = match app.cursor {
         None => end,
-        // The page stands still until the selected record leaves it.
+        // The page does not move until the selected record leaves it.
         Some(cursor) if (app.bottom.saturating_sub(rows)..app.bottom).contains(&cursor) => app.bottom,
         Some(cursor) if cursor + 1 == app.bottom.saturating_sub(rows) => cursor + rows,
         Some(cursor) if cursor == app.bottom => cursor + 1,

@@ -53,7 +53,7 @@ pub struct SimBus {
     others_acknowledge: bool,
     /// Share of the simulated nodes' frames that are destroyed, in per cent.
     error_percent: f64,
-    /// The controllers' next frames so many are destroyed.
+    /// How many of the controllers' next frames are destroyed.
     disturbed: u32,
     random: fastrand::Rng,
     phase: Phase,

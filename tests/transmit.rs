@@ -64,6 +64,25 @@ fn frames_leave_in_order_and_each_is_confirmed_with_its_time() {
     assert_eq!((status.channels[0].transmitted, status.channels[0].tx_pending), (40, 0));
 }
 
+/// The interrupt that stamps is silent until the task behind it has run. Two that ended meanwhile have one stamp between them, which is
+/// the first one's; the second must not be said to have ended before it did.
+#[test]
+fn what_ended_while_the_task_was_kept_waiting_is_not_stamped_early() {
+    let queue = Queue::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    send(&mut bench, 0..2).unwrap();
+    let stamp = bench.board.clock.now.get();
+    bench.board.traffic[0].send_one().unwrap();
+    bench.pass(50 * TICKS_PER_US);
+    bench.board.traffic[0].send_one().unwrap();
+    let second = bench.board.clock.now.get();
+    bench.board.capture.on_transmit(CAN1, &mut bench.board.traffic, &bench.board.clock, stamp);
+    flush(&mut bench);
+    let sent = |(_, record): &&(u64, Record)| matches!(record, Record::Event(Event::Transmitted { .. }));
+    let times: Vec<u64> = bench.records.iter().filter(sent).map(|(at, _)| *at).collect();
+    assert_eq!(times, [u64::from(stamp), u64::from(second)]);
+}
+
 #[test]
 fn a_full_queue_pushes_back_and_takes_all_or_nothing() {
     let queue = Queue::new();

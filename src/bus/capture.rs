@@ -127,13 +127,15 @@ impl<'q, const N: usize> Capture<'q, N> {
     ) {
         let ended = self.recorder.time(entered);
         let patience = ended + Self::patience_ticks::<C>();
-        let state = &mut self.channels[channel.index()];
-        state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason);
+        let Self { recorder, channels, .. } = self;
+        let state = &mut channels[channel.index()];
+        let now = || recorder.time(clock.now());
+        state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason, ended, now);
         // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
         // than there is.
         self.load_in_time(traffic, clock, patience);
         let state = &mut self.channels[channel.index()];
-        let recorded = state.transmitter.record(&mut self.recorder, ended);
+        let recorded = state.transmitter.record(&mut self.recorder);
         let now = self.recorder.time(clock.now());
         if !recorded || state.transmitter.has_more(now) {
             state.transmitter.service(&mut traffic[channel.index()], &mut self.recorder, now);

@@ -51,7 +51,7 @@ pub struct Transmitter {
     replies_waiting: u8,
     /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
     /// is sent until it is written; what was in the mailboxes by then has room here too.
-    unconfirmed: Deque<Event, { 2 * MAILBOXES }>,
+    unconfirmed: Deque<(Event, u64), { 2 * MAILBOXES }>,
     /// The queue is being given up, as fast as its records find room.
     dropping: Option<TransmitFailure>,
     /// The controller stays off the bus: no mailbox is filled.
@@ -235,13 +235,22 @@ impl Transmitter {
         now: u64,
         reason: TransmitFailure,
     ) {
-        self.collect(traffic, reason);
+        self.collect(traffic, reason, now, || now);
         self.service(traffic, recorder, now);
     }
 
     /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::prepare_head`] may follow before
     /// [`Self::record`], so that a busy bus need not wait for the record.
-    pub fn collect(&mut self, traffic: &mut impl Traffic, reason: TransmitFailure) {
+    ///
+    /// The first ended at `ended`. What else has finished by now did so later, nobody knows when: its time is when it was found.
+    pub fn collect(
+        &mut self,
+        traffic: &mut impl Traffic,
+        reason: TransmitFailure,
+        ended: u64,
+        mut now: impl FnMut() -> u64,
+    ) {
+        let mut first = true;
         while !self.unconfirmed.is_full() {
             let Some((mailbox, outcome)) = traffic.take_finished() else { break };
             let Some((tag, frame)) = self.mailboxes.take(mailbox) else { continue };
@@ -255,8 +264,10 @@ impl Transmitter {
             };
             let counter = if outcome == Outcome::Sent { &mut self.sent } else { &mut self.failed };
             *counter = counter.wrapping_add(1);
+            let at = if first { ended } else { now() };
+            first = false;
             // Cannot fail: checked above.
-            let _ = self.unconfirmed.push_back(event);
+            let _ = self.unconfirmed.push_back((event, at));
         }
     }
 
@@ -296,10 +307,10 @@ impl Transmitter {
         }
     }
 
-    /// Records what has finished, at `ended`; false if the queue has no room for all of it.
-    pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, ended: u64) -> bool {
-        while let Some(event) = self.unconfirmed.front() {
-            if !recorder.event(event, ended) {
+    /// Records what has finished, each at its time; false if the queue has no room for all of it.
+    pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>) -> bool {
+        while let Some((event, at)) = self.unconfirmed.front() {
+            if !recorder.event(event, *at) {
                 return false;
             }
             self.unconfirmed.pop_front();
@@ -314,7 +325,7 @@ impl Transmitter {
         recorder: &mut Recorder<'_, N>,
         now: u64,
     ) {
-        if !self.record(recorder, now) {
+        if !self.record(recorder) {
             return;
         }
         if let Some(reason) = self.dropping {

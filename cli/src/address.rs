@@ -106,6 +106,11 @@ impl Address {
         !matches!(&self.place, Place::Virtual(options) if options.settings.is_none())
     }
 
+    /// Whether a text is meant for a device that needs no port, and for nothing else.
+    pub fn is_no_port(text: &str) -> bool {
+        text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")
+    }
+
     /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
     pub fn is_car(&self) -> bool {
         matches!(&self.place, Place::Virtual(options) if options.car)

@@ -59,6 +59,15 @@ fn the_live_view_shows_signals_by_itself_and_says_whose_they_are() {
 }
 
 #[test]
+fn a_device_in_the_place_of_a_trace_is_told_apart() {
+    let output =
+        Command::new(env!("CARGO_BIN_EXE_cantap")).args(["monitor", "virtual:car"]).output().unwrap();
+    assert_eq!(output.status.code(), Some(2));
+    let said = String::from_utf8(output.stderr).unwrap();
+    assert!(said.contains("write cantap monitor -d virtual:car"), "{said}");
+}
+
+#[test]
 fn messages_are_sent_by_the_car_s_own_names() {
     let send = |frame: &str| cantap(&["send", "-d", "virtual:car", "1", frame]);
     let (sent, said) = send("SWM_Buttons:Button=Phone,ButtonPressed=1");

@@ -22,6 +22,7 @@ use crate::monitor::profile::Profile;
 use crate::monitor::source::{Order, Origin, Plan};
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -95,6 +96,10 @@ fn size(text: &str) -> Result<(u16, u16), String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let file = args.file.as_deref().filter(|path| !path.exists());
+    if let Some(name) = file.and_then(Path::to_str).filter(|name| Address::is_no_port(name)) {
+        return Err(wrong(format!("'{name}' is a device: write cantap monitor -d {name}")));
+    }
     // What is wrong with profile and databases is shown, and the view opens without it.
     let mut complaints = Vec::new();
     let profile = load_profile(args.profile.as_deref(), &mut complaints);

@@ -6,7 +6,7 @@ use std::io;
 use cantap::DeviceError;
 use cantap::bit_timing::TimingError;
 use cantap::wire::Refusal;
-use cantap_formats::{Format, OpenError, UnknownFormat};
+use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
 /// An error and its causes as the user reads them, but for causes that the error itself tells already.
@@ -30,7 +30,8 @@ pub fn told(error: &(dyn Error + 'static)) -> String {
         .downcast_ref()
         .and_then(of_device)
         .or_else(|| error.downcast_ref().and_then(of_timing))
-        .or_else(|| unknown_format(error).and_then(of_format));
+        .or_else(|| error.downcast_ref().map(of_nothing_read))
+        .or_else(|| unknown_format(error).and_then(|unknown| of_format(unknown, option(error))));
     advice.map_or_else(|| error.to_string(), |advice| format!("{error}{advice}"))
 }
 
@@ -76,9 +77,19 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
-fn of_format(error: &UnknownFormat) -> Option<String> {
+/// The option that names the format: of what is read, or of what is written.
+fn option(error: &(dyn Error + 'static)) -> &'static str {
+    if error.is::<OpenError>() { "--from" } else { "--format" }
+}
+
+fn of_format(error: &UnknownFormat, option: &str) -> Option<String> {
     matches!(error, UnknownFormat::Suffix(_))
-        .then(|| format!("; name it with one of --format {}", Format::names()))
+        .then(|| format!("; name it with one of {option} {}", Format::names()))
+}
+
+fn of_nothing_read(error: &NothingRead) -> String {
+    let _ = error;
+    "; if it is a trace, name its format with --from".to_owned()
 }
 
 /// The advice stands behind what is wrong, before the condition itself.
@@ -113,11 +124,11 @@ mod tests {
 
     #[test]
     fn a_name_without_a_format_is_explained_for_reading_and_writing() {
-        let expected = "the name 'a.xyz' does not tell the format; name it with one of --format candump, ";
+        let expected = "the name 'a.xyz' does not tell the format; name it with one of ";
         let unknown = || UnknownFormat::Suffix("a.xyz".to_owned());
         let (read, written) = (OpenError::from(unknown()), io::Error::other(unknown()));
-        for told in [told(&read), told(&written)] {
-            assert!(told.starts_with(expected), "{told}");
+        for (told, option) in [(told(&read), "--from"), (told(&written), "--format")] {
+            assert!(told.starts_with(&format!("{expected}{option} candump, ")), "{told}");
         }
     }
 }

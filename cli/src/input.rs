@@ -13,8 +13,8 @@ use crate::live::{LiveArgs, LiveRecords};
 /// How to read a trace; for commands to flatten into theirs.
 #[derive(clap::Args)]
 pub struct ReadArgs {
-    /// The trace's format, where the file's name does not tell.
-    #[arg(long, value_name = "FORMAT")]
+    /// The trace's format, where neither its content nor its name tell, or tell the wrong one.
+    #[arg(long = "from", alias = "format", value_name = "FORMAT")]
     pub format: Option<Format>,
     /// Wait for more at the end of the file, until Ctrl-C.
     #[arg(long)]
@@ -60,6 +60,12 @@ impl ReadArgs {
             zone: self.zone.clone(),
         };
         let mut reader = open_reader(path, &options)?;
+        if let Some(named) = reader.named_otherwise() {
+            let (name, format) = (path.display(), reader.format());
+            eprintln!(
+                "cantap: note: {name} is read as {format}, which its content is, and not as {named}; --from overrides"
+            );
+        }
         if self.follow {
             interrupt::watch()?;
             reader.end_when(interrupt::requested);
@@ -112,6 +118,24 @@ impl Records {
         }
     }
 
+    /// What of a file is no part of a CAN trace so far, by kind.
+    pub fn left_out(&self) -> LeftOut {
+        match &self.source {
+            Source::File(reader, _) => reader.left_out().clone(),
+            Source::Device(_) => LeftOut::default(),
+        }
+    }
+
+    /// What is not in the records that were read.
+    pub fn missing(&self) -> Missing {
+        let (issues, left_out) = (self.issues(), self.left_out());
+        let entries = match &self.source {
+            Source::File(reader, _) => reader.records(),
+            Source::Device(_) => 0,
+        };
+        Missing { issues, left_out, entries }
+    }
+
     /// What else there is to know about a file so far, and how often.
     pub fn notes(&self) -> LeftOut {
         match &self.source {
@@ -148,6 +172,48 @@ impl Records {
     }
 }
 
+/// What is not in the records of a file.
+#[derive(Default)]
+pub struct Missing {
+    /// Places that could not be read.
+    pub issues: u64,
+    /// What is no part of a CAN trace, by kind.
+    pub left_out: LeftOut,
+    /// Records that were read.
+    pub entries: u64,
+}
+
+impl Missing {
+    /// The share of the file's entries that is missing, in per cent; an issue counts as one.
+    pub fn share_pct(&self) -> f64 {
+        let missing = self.issues + self.left_out.total();
+        missing as f64 * 100.0 / (self.entries + missing).max(1) as f64
+    }
+
+    /// Counts by kind.
+    pub fn by_kind(&self) -> serde_json::Map<String, serde_json::Value> {
+        self.left_out.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
+    }
+
+    /// What is missing, in words; `None` if nothing is.
+    pub fn in_words(&self) -> Option<String> {
+        let places = match self.issues {
+            0 => None,
+            1 => Some("1 place could not be read".to_owned()),
+            issues => Some(format!("{issues} places could not be read")),
+        };
+        let kinds: Vec<_> = self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
+        let kinds = (!kinds.is_empty()).then(|| format!("no part of a CAN trace: {}", kinds.join(", ")));
+        let all: Vec<_> = places.into_iter().chain(kinds).collect();
+        let few = if self.share_pct() < 0.05 {
+            "less than 0.1".to_owned()
+        } else {
+            format!("{:.1}", self.share_pct())
+        };
+        (!all.is_empty()).then(|| format!("{}; {few} % of the file left out", all.join("; ")))
+    }
+}
+
 /// The next records; says what is wrong on the way, and at the end how often that was.
 fn batch_of_file(
     reader: &mut TraceReader,
@@ -163,13 +229,16 @@ fn batch_of_file(
             Some(Err(_)) => {}
         }
     }
+    if let Some(nothing) = reader.nothing_read() {
+        bail!(nothing);
+    }
     for (what, count) in reader.notes().iter() {
         eprintln!("cantap: note: {what} ({count})");
     }
-    match reader.issues() {
-        0 => {}
-        1 => eprintln!("cantap: 1 place in the file could not be read and was left out"),
-        issues => eprintln!("cantap: {issues} places in the file could not be read and were left out"),
+    let missing =
+        Missing { issues: reader.issues(), left_out: reader.left_out().clone(), entries: reader.records() };
+    if let Some(words) = missing.in_words() {
+        eprintln!("cantap: {words}");
     }
     Ok(false)
 }

@@ -21,6 +21,7 @@ macro_rules! eprint {
 mod address;
 mod advice;
 mod args;
+mod beside;
 mod channel_args;
 mod channel_bitrate;
 mod clock;

@@ -50,7 +50,7 @@ fn text_names_values_units_and_texts() {
     assert_eq!(
         err,
         "cantap: trace.log, line 3: expected a log line such as '(1410714882.622188) can0 123#DEADBEEF', found 'broken'\n\
-         cantap: 1 place in the file could not be read and was left out\n\
+         cantap: 1 place could not be read; 20.0 % of the file left out\n\
          cantap: decoded 3 of 4 frames, 9 values\n"
     );
 }

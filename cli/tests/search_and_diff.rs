@@ -148,13 +148,13 @@ fn differences_are_listed() {
         cantap("diff", &["diff", "a.log", "b.log", "--json", "--check", "--tolerance", "60"]);
     assert_eq!(code, Some(3));
     let found: serde_json::Value = serde_json::from_str(&out).unwrap();
-    let key = |id: &str| serde_json::json!({ "ch": 1, "id": id, "remote": false });
+    let key = |id: &str| serde_json::json!({ "ch": 1, "id": id, "remote": false, "fd": false });
     let with = |mut value: serde_json::Value, more: serde_json::Value| {
         value.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
         value
     };
     let bytes = serde_json::json!([{ "byte": 0, "a": "0x1x000x", "b": "0x10000x" }]);
-    let changed = serde_json::json!({ "period_ms": null, "dlc": null, "bytes": bytes });
+    let changed = serde_json::json!({ "period_ms": null, "dlc": null, "fd_flags": null, "bytes": bytes });
     assert_eq!(
         found,
         serde_json::json!({
@@ -162,6 +162,9 @@ fn differences_are_listed() {
             "only_b": [with(key("124"), serde_json::json!({ "count": 1 }))],
             "changed": [with(key("001"), changed)],
             "same": 1,
+            "issues": 0,
+            "left_out": {},
+            "missing_pct": [0.0, 0.0],
             "equal": false,
         })
     );

@@ -6,11 +6,12 @@ use std::process::ExitCode;
 use anyhow::{Context, bail};
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{
-    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone,
+    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, TraceWriter, WriteOptions, Zone,
     create_writer,
 };
 use cantap_trace::filter::Filter;
 
+use crate::beside::Beside;
 use crate::input::ReadArgs;
 use crate::interrupt;
 
@@ -28,8 +29,8 @@ use crate::interrupt;
     Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, pcapng, \
     mf4, dif. Only read: pcap, csv-gvret (SavvyCAN), candump-screen, busmaster, crtd, kvaser, microchip, canhacker, \
     printer (python-can).\n\n\
-    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, or with --strict \
-    something in IN was wrong.")]
+    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read (an older \
+    OUT then stays as it is), or with --strict something in IN was wrong.")]
 pub struct Args {
     /// The trace to read; - for standard input.
     #[arg(value_name = "IN")]
@@ -40,7 +41,7 @@ pub struct Args {
     /// Only these frames, in candump's syntax: can0,123:7FF,400~7F0,#FF,j. Any of several.
     #[arg(value_name = "FILTER")]
     filters: Vec<Filter>,
-    /// The format of IN, where neither its name nor its beginning tell. All are listed below.
+    /// The format of IN, where neither its content nor its name tell, or tell the wrong one. All are listed below.
     #[arg(long, value_name = "FORMAT")]
     from: Option<Format>,
     /// Wait for more at the end of IN, until Ctrl-C.
@@ -137,16 +138,29 @@ pub fn report(left_out: &LeftOut, path: &Path) {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
-    let options = args.write.options(None)?;
+    let mut options = args.write.options(None)?;
+    let failed = || format!("cannot write {}", shown(&args.output));
+    if options.format.is_none() && args.output.as_os_str() != "-" {
+        let format = Format::of_path(&args.output);
+        let format = format.map_err(|error| std::io::Error::new(std::io::ErrorKind::InvalidInput, error));
+        options.format = Some(format.with_context(failed)?);
+    }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
     let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter, zone };
     let mut records = read.open(&args.input)?;
-    if records.end_when(interrupt::requested) {
+    let grows = records.end_when(interrupt::requested);
+    if grows {
         interrupt::watch()?;
     }
-    let failed = || format!("cannot write {}", shown(&args.output));
-    let mut writer = create_writer(&args.output, &options).with_context(failed)?;
+    let mut writer: Option<Box<dyn TraceWriter>> = None;
+    let mut beside = None;
+    // Not before there is something to write: where nothing can be read, an older OUT stays as it is.
+    let mut create = || -> anyhow::Result<_> {
+        beside = if args.write.rotate.is_empty() && !grows { Beside::of(&args.output) } else { None };
+        let path = beside.as_ref().map_or(&args.output, |beside: &Beside| &beside.temporary);
+        create_writer(path, &options).with_context(failed)
+    };
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
@@ -157,6 +171,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Ok(false) => break Ok(()),
             Err(error) => break Err(error),
         }
+        let writer = match &mut writer {
+            Some(writer) => writer,
+            none => none.insert(create()?),
+        };
         for record in &batch {
             // The window's first record is the trace's, whatever the channel.
             let inside = window.contains(record);
@@ -169,18 +187,30 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             writer.flush().with_context(failed)?;
         }
     };
-    let left_out = writer.finish().with_context(failed)?;
+    let writer = match (writer, &read) {
+        (Some(writer), _) => writer,
+        // An empty trace is one all the same.
+        (None, Ok(())) => create()?,
+        (None, Err(_)) => return read.map(|()| ExitCode::SUCCESS),
+    };
+    let mut left_out = writer.finish().with_context(failed)?;
+    if let Some(beside) = beside {
+        beside.put_in_place().with_context(failed)?;
+    }
     report(&left_out, &args.output);
     read?;
     if args.json {
         let object = |counts: &LeftOut| -> serde_json::Map<_, _> {
             counts.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
         };
+        let missing = records.missing();
+        left_out.merge(&missing.left_out);
         let summary = serde_json::json!({
             "records": written,
-            "issues": records.issues(),
+            "issues": missing.issues,
             "notes": object(&records.notes()),
             "left_out": object(&left_out),
+            "missing_pct": missing.share_pct(),
         });
         if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }
     }

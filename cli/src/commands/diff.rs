@@ -4,11 +4,12 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use cantap_trace::Interface;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
 use crate::exit;
-use crate::input::ReadArgs;
+use crate::input::{Missing, ReadArgs};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -47,11 +48,17 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let (a, b) = (profile(args, &args.a)?, profile(args, &args.b)?);
+    let ((a, missing_a), (b, missing_b)) = (profile(args, &args.a)?, profile(args, &args.b)?);
     let difference = compare(&a, &b, args.tolerance / 100.0);
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
-        writeln!(out, "{}", to_json(&difference))?;
+        let mut object = to_json(&difference);
+        let mut left_out = missing_a.left_out.clone();
+        left_out.merge(&missing_b.left_out);
+        object["issues"] = (missing_a.issues + missing_b.issues).into();
+        object["left_out"] = Missing { left_out, ..Missing::default() }.by_kind().into();
+        object["missing_pct"] = json!([missing_a.share_pct(), missing_b.share_pct()]);
+        writeln!(out, "{object}")?;
     } else {
         print(args, &difference, &mut out)?;
     }
@@ -60,7 +67,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(if failed { ExitCode::from(exit::CHECK_FAILED) } else { ExitCode::SUCCESS })
 }
 
-fn profile(args: &Args, path: &Path) -> anyhow::Result<Profile> {
+fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing)> {
     let mut profile = if args.ignore_channels { Profile::ignoring_channels() } else { Profile::default() };
     let mut records = args.read.open(path)?;
     let mut batch = Vec::new();
@@ -69,12 +76,11 @@ fn profile(args: &Args, path: &Path) -> anyhow::Result<Profile> {
             profile.add(record);
         }
     }
-    Ok(profile)
+    Ok((profile, records.missing()))
 }
 
-fn name(key: Key) -> String {
-    // candump numbers interfaces from 0; no channel is channel 0.
-    let channel = key.channel.checked_sub(1).map(|interface| format!("can{interface} ")).unwrap_or_default();
+fn name(args: &Args, key: Key) -> String {
+    let channel = if args.ignore_channels { String::new() } else { format!("{} ", Interface(key.channel)) };
     format!(
         "{channel}{}{}",
         key.id,
@@ -91,11 +97,11 @@ fn name(key: Key) -> String {
 fn print(args: &Args, difference: &Difference, out: &mut impl Write) -> std::io::Result<()> {
     for (path, only) in [(&args.a, &difference.only_a), (&args.b, &difference.only_b)] {
         for (key, count) in only {
-            writeln!(out, "{}: only in {} ({count} frames)", name(*key), path.display())?;
+            writeln!(out, "{}: only in {} ({count} frames)", name(args, *key), path.display())?;
         }
     }
     for Changed { key, period_ns, dlcs, flags, bytes } in &difference.changed {
-        let name = name(*key);
+        let name = name(args, *key);
         if let Some((a, b)) = period_ns {
             writeln!(out, "{name}: period {:.3} ms -> {:.3} ms", a / 1e6, b / 1e6)?;
         }

@@ -11,6 +11,7 @@ use cantap_formats::{TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
 use cantap_signals::{Decoder, SignalValue};
+use cantap_trace::Interface;
 
 use super::decode;
 use crate::databases::DatabaseArgs;
@@ -184,7 +185,7 @@ impl Sink {
             Kind::Nowhere => Ok(()),
             Kind::Trace(writer) => writer.write(record),
             Kind::Text(out) => {
-                write!(out, "({time}) can{} ", record.channel.saturating_sub(1))?;
+                write!(out, "({time}) {} ", Interface(record.channel))?;
                 match record.frame() {
                     Some(frame) => write!(out, "{frame}")?,
                     None => write!(out, "{}", describe(&record.event))?,

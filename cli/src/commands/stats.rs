@@ -16,7 +16,7 @@ use self::windows::Windows;
 use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::input::ReadArgs;
+use crate::input::{Missing, ReadArgs};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -87,6 +87,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut statistics = Statistics::new(args.options())?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
     let mut ended = Ok(());
+    let mut missing = Missing::default();
     if let Some(address) = &args.device {
         ended = live::run(args, address, &mut statistics, &mut windows);
     } else if let Some(path) = &args.input {
@@ -103,6 +104,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             }
         }
         statistics.finish_with(&mut closed);
+        missing = records.missing();
     } else {
         bail!("name a file, or a device with -d");
     }
@@ -115,9 +117,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Its reader may have gone; that is an error as any other.
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
-        write_json(&summary, windows, &mut out)?;
+        write_json(&summary, &missing, windows, &mut out)?;
     } else {
-        out.write_all(table::text(&summary, args.per_id).as_bytes())?;
+        out.write_all(table::text(&summary, &missing, args.per_id).as_bytes())?;
         if let Some(windows) = windows {
             write_windows(&summary, windows, &mut out)?;
         }
@@ -129,10 +131,18 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// One object; the windows are its last member and go through memory one by one.
-fn write_json(summary: &Summary, windows: Option<Windows>, out: &mut impl Write) -> anyhow::Result<()> {
+fn write_json(
+    summary: &Summary,
+    missing: &Missing,
+    windows: Option<Windows>,
+    out: &mut impl Write,
+) -> anyhow::Result<()> {
     let object = serde_json::to_string(summary)?;
-    let Some(windows) = windows else { return Ok(writeln!(out, "{object}")?) };
     let members = object.strip_suffix('}').context("a summary is an object")?;
+    let (issues, left_out) = (missing.issues, serde_json::to_string(&missing.by_kind())?);
+    let share = missing.share_pct();
+    let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
+    let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };
     write!(out, "{members},\"windows\":[")?;
     let mut comma = "";
     windows.for_each(|window| Ok(write!(out, "{}{window}", std::mem::replace(&mut comma, ","))?))?;

@@ -1,11 +1,12 @@
 //! Vector's ASC: lines of text with times relative to a date in the head.
 //!
 //! Classical frames, error frames and the controller's state are events of the format; a loss is a status
-//! line with the details in a trailing comment. Everything else in such a file (statistics, other
-//! buses, markers) is passed over. Dates are taken as UTC.
+//! line with the details in a trailing comment. Everything else that is known of such files (statistics, other
+//! buses, markers) is counted by its kind. Dates are taken as UTC.
 
 mod decode;
 mod encode;
+mod others;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;
@@ -67,7 +68,7 @@ mod tests {
         let (log, issues) = as_log(lines);
         assert_eq!(
             log,
-            "(1506783973.206991) can0 20000284#0030000000008400\n\
+            "(1506783973.206991) can0 20000204#0030000000008400\n\
              (1506783975.692000) can1 0C8#0908070605040302 T\n\
              (1506783975.711002) can2 200#R T\n\
              (1506783975.775921) can3 300#R8\n\
@@ -78,6 +79,32 @@ mod tests {
              (1506783978.491000) can1 30A#11C2\n"
         );
         assert_eq!(issues, Vec::<String>::new());
+    }
+
+    #[test]
+    fn damaged_lines_are_issues_and_other_things_are_counted_by_kind() {
+        let damaged = "0.2 1 18EBGF00x Rx d 1 00\n0.3 l 100 Rx d 0\n0.3 300 100 Rx d 0\n0.3 1 100 Px d 0\n\
+                       0.3 1 100 Rx d 1 00 01\n0.3 CANFD 1 Px 100 0 0 0 0 0 0 1000\n0.3 CAN 1 Stutus:bus off\n";
+        let (log, issues) = as_log(damaged);
+        assert_eq!((log.as_str(), issues.len()), ("", 7), "{issues:?}");
+        let others = "0.1 1 OverloadFrame\n0.2 L1 3e Tx 8 00\n0.2 Li 3e Rx 1 00\n0.3 SV: 1 0 1 ::a = 1\n0.4 a := 1\n\
+                      0.5 ETH 1 Rx 60:ff\n0.6 1 Statistic: D 0\n0.7 // words\n0.8 CAN 1 Status:sleeping\n\
+                      0.9 1 100 TxRq d 0\n";
+        let source = std::io::Cursor::new(format!("{HEAD}{others}"));
+        let options = crate::ReadOptions::default();
+        let mut reader = crate::TraceReader::from_source("test", source, Format::Asc, &options).unwrap();
+        assert_eq!(reader.by_ref().filter_map(Result::err).count(), 0);
+        let expected = [
+            ("CAN overload frames", 1),
+            ("CAN statistics", 1),
+            ("Ethernet frames and events", 1),
+            ("LIN frames and events", 2),
+            ("comments and texts", 1),
+            ("environment and system variables", 2),
+            ("other states of the controller", 1),
+        ];
+        assert_eq!(reader.left_out().iter().collect::<Vec<_>>(), expected);
+        assert_eq!(reader.notes().iter().count(), 1);
     }
 
     #[test]

@@ -10,7 +10,7 @@ use super::codec::{BATCH, Decode, Encode};
 use super::error_frames::ErrorFrames;
 use super::found::Found;
 use super::input::Input;
-use super::interfaces::{self, Interfaces};
+use super::interfaces::Interfaces;
 use super::issue::Fault;
 use super::left_out::LeftOut;
 use super::line::{Line, Seconds};
@@ -141,9 +141,15 @@ impl Decoder {
     /// end, and a cut line may look whole: what counts is whether the identifier had longer frames before.
     fn was_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
         match record.frame() {
-            Some(frame) => {
-                line.ends_with(b" ") || !frame.is_remote() && self.lengths.of(frame.id()) > frame.dlc()
+            Some(frame) if line.ends_with(b" ") || frame.is_remote() => {
+                !frame.is_remote() || line.ends_with(b" ")
             }
+            Some(frame) if frame.dlc() == 8 && !frame.is_fd() => false,
+            // A file of one line was hardly cut; in others an identifier seldom comes for the first time in the last one.
+            Some(frame) => match self.lengths.of(frame.id()) {
+                Some(longest) => longest > frame.dlc(),
+                None => self.lengths.any,
+            },
             None => line.len() - line.iter().position(|byte| *byte == b'#').unwrap_or(0) <= 16,
         }
     }
@@ -190,8 +196,12 @@ impl Decoder {
     }
 }
 
-/// How long the last data frames of recent identifiers were.
-struct Lengths(Box<[(u32, u8); Self::PLACES]>);
+/// How long the longest data frames of recent identifiers were.
+struct Lengths {
+    places: Box<[(u32, u8); Self::PLACES]>,
+    /// There was a data frame.
+    any: bool,
+}
 
 impl Lengths {
     /// More identifiers than most buses have, and little enough for the processor's cache.
@@ -208,20 +218,23 @@ impl Lengths {
     #[inline]
     fn note(&mut self, id: Id, dlc: u8) {
         let (place, key) = Self::key(id);
-        self.0[place] = (key, dlc);
+        let (known, longest) = &mut self.places[place];
+        *longest = if *known == key { dlc.max(*longest) } else { dlc };
+        *known = key;
+        self.any = true;
     }
 
-    /// 0 if it is not known.
-    fn of(&self, id: Id) -> u8 {
+    fn of(&self, id: Id) -> Option<u8> {
         let (place, key) = Self::key(id);
-        let (known, len) = self.0[place];
-        if known == key { len } else { 0 }
+        let (known, len) = self.places[place];
+        (known == key).then_some(len)
     }
 }
 
 impl Default for Lengths {
     fn default() -> Self {
-        Self(Box::new([(0, 0); Self::PLACES]))
+        // No identifier has these bits.
+        Self { places: Box::new([(u32::MAX, 0); Self::PLACES]), any: false }
     }
 }
 
@@ -303,8 +316,12 @@ impl Encode for Encoder {
             out.push(b'(');
             text::push_time(out, record.time_ns, NS_PER_S, 6, b'.');
         }
-        line.put(b") can");
-        line.put_small(interfaces::number(record.channel));
+        if record.channel == 0 {
+            line.put(b") channel0");
+        } else {
+            line.put(b") can");
+            line.put_small(record.channel - 1);
+        }
         line.put(b" ");
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
@@ -325,9 +342,11 @@ impl Encode for Encoder {
             }
             event => {
                 // Every event but a frame has an error frame. python-can takes one without this class for
-                // a frame on the bus.
+                // a frame on the bus; a change of state stays as the kernel has it all the same.
                 if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
-                    line.put(&text::hex_digits_of(ERROR_FLAG | BUS_ERROR | classes));
+                    let is_state = matches!(event, TraceEvent::State { .. });
+                    let class = if is_state { 0 } else { BUS_ERROR };
+                    line.put(&text::hex_digits_of(ERROR_FLAG | class | classes));
                     line.put(b"#");
                     line.put(&text::hex_digits_of_eight(data));
                 }
@@ -413,25 +432,54 @@ mod tests {
     /// A complete log may lack its last line end; a cut line can look whole.
     #[test]
     fn a_last_line_without_its_end_counts_unless_the_identifier_had_longer_frames() {
-        let before = "(1.000000) can0 123#DEADBEEF\n(2.000000) can0 456#\n";
+        // The last frame before was a short one; what counts is the longest.
+        let before = "(1.000000) can0 123#DEADBEEF\n(2.000000) can0 456#\n(2.000000) can0 123#DE\n";
         for (last, records, issues) in [
             ("(3.000000) can0 123#DEADBEEF", 3, 0),
             ("(3.000000) can0 123#DEAD", 2, 1),
             ("(3.000000) can0 123#DEADB", 2, 1),
             ("(3.000000) can0 456#DE", 3, 0),
-            ("(3.000000) can0 789#DE", 3, 0),
+            ("(3.000000) can0 789#DE", 2, 1),
+            ("(3.000000) can0 789#1122334455667788", 3, 0),
+            ("(3.000000) can0 123##1DEADBEEF", 3, 0),
+            ("(3.000000) can0 123##1DEADBE", 2, 1),
             ("(3.000000) can0 123#R", 3, 0),
             ("(3.000000) can0 123#DEADBEEF ", 2, 1),
             ("(3.000000) can0 20000004#0001", 2, 1),
             ("(3.000000) ca", 2, 1),
         ] {
             let (got, told) = tests::read(Format::Candump, format!("{before}{last}"));
-            assert_eq!((got.len(), told.len()), (records, issues), "{last}: {told:?}");
+            assert_eq!((got.len(), told.len()), (records + 1, issues), "{last}: {told:?}");
             assert!(
-                told.iter().all(|issue| issue.contains("line 3: the file ends inside a line")),
+                told.iter().all(|issue| issue.contains("line 4: the file ends inside a line")),
                 "{told:?}"
             );
         }
+    }
+
+    #[test]
+    fn a_change_of_state_and_a_channel_0_stay_what_they_are() {
+        let log =
+            "(1.000000) can0 20000040#0000000000000000\n(2.000000) channel0 123#11\n(3.000000) can0 123#11\n";
+        let (records, issues) = tests::read(Format::Candump, log);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(records.iter().map(|record| record.channel).collect::<Vec<_>>(), [1, 0, 1]);
+        assert_eq!(tests::write(Format::Candump, &records), log);
+        assert_eq!(tests::round_trip(Format::Pcapng, &records), records);
+        assert_eq!(tests::round_trip(Format::Asc, &records), records);
+        assert_eq!(tests::round_trip(Format::Blf, &records), records);
+    }
+
+    #[test]
+    fn an_over_long_line_is_one_issue_and_the_next_has_its_number() {
+        let log = format!("(1.0) can0 123#11\n{}\nrubbish\n(2.0) can0 123#11\n", "x".repeat(9 << 20));
+        let (records, issues) = tests::read(Format::Candump, log);
+        assert_eq!(records.len(), 2);
+        assert_eq!(issues.len(), 2);
+        assert!(
+            issues[0].starts_with("test, line 2: ") && issues[1].starts_with("test, line 3: "),
+            "{issues:?}"
+        );
     }
 
     #[test]

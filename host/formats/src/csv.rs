@@ -5,6 +5,7 @@
 //! people and spreadsheets and carries everything. The earlier CANanalyser's is in
 //! [`analyser`](super::analyser).
 
+use std::collections::VecDeque;
 use std::io;
 
 use cantap_wire::{Frame, Id};
@@ -49,9 +50,8 @@ pub(crate) struct Decoder {
     dialect: Option<CsvDialect>,
     analyser: analyser::RowDecoder,
     gvret: gvret::RowDecoder,
-    /// Lines before the head that may be the analyser's comments, and what is wrong if they are not.
-    comments: u32,
-    no_head: Option<(Place, Fault)>,
+    /// Lines before the head that may be the analyser's comments: what is wrong if they are not.
+    no_head: VecDeque<(Place, Fault)>,
     error_frames: ErrorFrames,
 }
 
@@ -66,6 +66,12 @@ impl Decode for Decoder {
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
         if let Some(found) = self.error_frames.next() {
             return Ok(found);
+        }
+        // Too many for comments, or in front of a head that has none.
+        if (self.dialect.is_some() || self.no_head.len() > MAX_COMMENTS)
+            && let Some((place, fault)) = self.no_head.pop_front()
+        {
+            return Ok(Found::Issue(place, fault));
         }
         while let Some(line) = input.line()? {
             let text = line.text.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(line.text).trim_ascii();
@@ -90,22 +96,22 @@ impl Decode for Decoder {
                 Ok(None) => {}
                 Err(fault) if self.dialect.is_none() => {
                     // The analyser's file begins with comments; they are told from damage by the head behind them.
-                    self.comments += 1;
-                    if self.comments > MAX_COMMENTS {
-                        return Ok(line.issue(fault));
+                    self.no_head.push_back((Place::Line(line.number), fault));
+                    if self.no_head.len() > MAX_COMMENTS
+                        && let Some((place, fault)) = self.no_head.pop_front()
+                    {
+                        return Ok(Found::Issue(place, fault));
                     }
-                    self.no_head.get_or_insert((Place::Line(line.number), fault));
                 }
                 Err(fault) => return Ok(line.issue(fault)),
             }
         }
-        let no_head = self.no_head.take().filter(|_| self.dialect.is_none());
-        Ok(no_head.map_or(Found::End, |(place, fault)| Found::Issue(place, fault)))
+        Ok(self.no_head.pop_front().map_or(Found::End, |(place, fault)| Found::Issue(place, fault)))
     }
 }
 
 /// More lines than this before the head are no comments.
-const MAX_COMMENTS: u32 = 100;
+const MAX_COMMENTS: usize = 100;
 
 impl Decoder {
     /// Whether a last row that looks whole, and has no line end, may have lost the end of what it says.
@@ -130,6 +136,7 @@ impl Decoder {
             self.dialect = Some(CsvDialect::Gvret);
         } else if self.analyser.head(line) {
             self.dialect = Some(CsvDialect::Analyser);
+            self.no_head.clear();
         } else {
             // Without its head a table is most likely one of python-can's columns, cut out of a file.
             let row = python_can(line, &mut self.error_frames);
@@ -157,6 +164,15 @@ fn columns<const N: usize>(line: &[u8]) -> Result<[&[u8]; N], Fault> {
     if count == N { Ok(columns) } else { Err(Fault::malformed(format!("{N} columns"), line)) }
 }
 
+/// A column that says yes or no.
+fn flag(word: &[u8]) -> Result<bool, Fault> {
+    match word {
+        b"0" | b"False" | b"false" => Ok(false),
+        b"1" | b"True" | b"true" => Ok(true),
+        other => Err(Fault::malformed("0 or 1 as a flag", other)),
+    }
+}
+
 fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault> {
     let [time, id, extended, remote, error, dlc, data] = columns(line)?;
     let time_ns = python_time(time).ok_or_else(|| Fault::malformed("a time in seconds", time))?;
@@ -167,13 +183,13 @@ fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault>
     let present = bytes.len().min(8);
     padded[..present].copy_from_slice(&bytes[..present]);
     let record = |event| TraceRecord { time_ns, channel: 1, event };
-    if error == b"1" {
+    let [extended, remote, error] = [flag(extended)?, flag(remote)?, flag(error)?];
+    if error {
         let (event, second) = error_frames.read(raw, padded);
         return Ok(Some((record(event), second)));
     }
-    let parsed = if extended == b"1" { Id::extended(raw) } else { Id::standard(raw) };
+    let parsed = if extended { Id::extended(raw) } else { Id::standard(raw) };
     let parsed = parsed.ok_or_else(|| Fault::malformed("an identifier that fits its format", id))?;
-    let remote = remote == b"1";
     let number = text::decimal(dlc).ok_or_else(|| Fault::malformed("a length", dlc))?;
     let data_event =
         |frame| Ok(Some((record(TraceEvent::Frame { frame, direction: Direction::Rx, late: false }), None)));
@@ -522,6 +538,24 @@ mod tests {
             tests::read(Format::Csv(CsvDialect::PythonCan), bad).1[0]
                 .contains("a length that CAN or CAN FD has")
         );
+    }
+
+    #[test]
+    fn flags_are_read_or_refused_and_every_unknown_line_counts() {
+        let file = "timestamp,arbitration_id,extended,remote,error,dlc,data\n1.0,0x800,True,0,0,0,\n\
+                    1.0,0x1,2,0,0,0,\n1.0,0x1,0,x,0,0,\n1.0,0x1,0,0,,0,\n2.0,0x1,False,0,0,0,\n";
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), file);
+        assert_eq!(
+            tests::write(Format::Candump, &records),
+            "(1.000000) can0 00000800#\n(2.000000) can0 001#\n"
+        );
+        assert_eq!(issues.len(), 3, "{issues:?}");
+        // Every line of a file that is none of ours counts, and those before a head too.
+        let file = "not a table\n".repeat(150);
+        assert_eq!(tests::read(Format::Csv(CsvDialect::PythonCan), &file).1.len(), 150);
+        let file = format!("rubbish\nmore\n{PYTHON_CAN_HEAD}\n2.0,0x1,0,0,0,0,\n");
+        let (records, issues) = tests::read(Format::Csv(CsvDialect::PythonCan), &file);
+        assert_eq!((records.len(), issues.len()), (1, 2), "{issues:?}");
     }
 
     #[test]

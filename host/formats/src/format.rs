@@ -142,6 +142,11 @@ impl Format {
             .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
     }
 
+    /// Whether both are read by the same reader: versions and dialects are told by the content.
+    pub fn is_kind_of(self, other: Self) -> bool {
+        std::mem::discriminant(&self) == std::mem::discriminant(&other)
+    }
+
     /// By a file's first bytes.
     pub fn of_content(head: &[u8]) -> Option<Self> {
         /// Where the head of a log names its program.

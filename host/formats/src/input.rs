@@ -46,6 +46,8 @@ pub(crate) struct Input {
     /// Whether its bytes are the file's, neither unpacked nor turned into others.
     is_as_it_is: bool,
     zone: Zone,
+    /// The beginning of a line too long to hold.
+    long: Vec<u8>,
 }
 
 /// One line, without its end.
@@ -95,6 +97,7 @@ impl Input {
             file: None,
             is_as_it_is: true,
             zone: Zone::default(),
+            long: Vec::new(),
         }
     }
 
@@ -288,17 +291,17 @@ impl Input {
     #[inline]
     pub(crate) fn line(&mut self) -> io::Result<Option<Line<'_>>> {
         let mut searched = 0;
-        let (len, terminated, too_long) = loop {
+        let (len, terminated) = loop {
             let unsearched = &self.buffer[self.start + searched..self.end];
             if let Some(at) = memchr::memchr(b'\n', unsearched) {
-                break (searched + at, true, false);
+                break (searched + at, true);
             }
             searched = self.end - self.start;
             if searched >= MAX_ITEM_BYTES {
-                break (searched, false, true);
+                return self.long_line().map(Some);
             }
             if !self.fill()? {
-                break (searched, false, false);
+                break (searched, false);
             }
         };
         if len == 0 && !terminated {
@@ -306,13 +309,29 @@ impl Input {
         }
         let at = self.start;
         self.consume(len + usize::from(terminated));
-        self.lines += u64::from(terminated || !too_long);
+        self.lines += 1;
         let mut text = &self.buffer[at..at + len];
         if let [rest @ .., b'\r'] = text {
             text = rest;
         }
-        // The rest of a line too long comes as further items, which no format accepts either.
-        Ok(Some(Line { text, number: self.lines, terminated, too_long }))
+        Ok(Some(Line { text, number: self.lines, terminated, too_long: false }))
+    }
+
+    /// A line too long to hold: its beginning. The rest is passed over.
+    #[cold]
+    fn long_line(&mut self) -> io::Result<Line<'_>> {
+        const KEPT: usize = 200;
+        self.long = self.buffer[self.start..self.end].iter().take(KEPT).copied().collect();
+        let terminated = loop {
+            let rest = &self.buffer[self.start..self.end];
+            let (used, found) = memchr::memchr(b'\n', rest).map_or((rest.len(), false), |at| (at + 1, true));
+            self.consume(used);
+            if found || !self.fill()? {
+                break found;
+            }
+        };
+        self.lines += 1;
+        Ok(Line { text: &self.long, number: self.lines, terminated, too_long: true })
     }
 }
 

@@ -18,7 +18,7 @@ impl LeftOut {
     }
 
     /// Adds another file's.
-    pub(crate) fn merge(&mut self, other: &Self) {
+    pub fn merge(&mut self, other: &Self) {
         for (what, count) in &other.0 {
             self.add(what, *count);
         }
@@ -27,6 +27,11 @@ impl LeftOut {
     /// Whether everything was written.
     pub fn is_empty(&self) -> bool {
         self.0.is_empty()
+    }
+
+    /// All counts together.
+    pub fn total(&self) -> u64 {
+        self.0.values().sum()
     }
 
     /// Descriptions and counts.

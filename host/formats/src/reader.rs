@@ -1,10 +1,12 @@
 //! Reading a trace of any format as a stream.
 
+use std::borrow::Cow;
 use std::io::{self, Read};
 use std::path::Path;
 use std::sync::Arc;
 
 use super::codec::{BATCH, Decode};
+use super::content;
 use super::found::Found;
 use super::input::Input;
 use super::issue::{Fault, Place, ReadIssue};
@@ -20,7 +22,7 @@ use cantap_trace::TraceRecord;
 /// How to read.
 #[derive(Clone, Debug, Default)]
 pub struct ReadOptions {
-    /// The format; by the file's suffix or first bytes if not given.
+    /// The format; if not given, by the file's first bytes where they are clear, else by its suffix.
     pub format: Option<Format>,
     /// Wait for more at the end of the file instead of ending.
     pub follow: bool,
@@ -42,6 +44,18 @@ pub enum OpenError {
     Format(#[from] UnknownFormat),
 }
 
+/// Nothing of a file could be read, and it is not simply empty.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("nothing in {file} could be read as {format}; it looks like {looks_like}")]
+pub struct NothingRead {
+    /// The file's name as it was given.
+    pub file: Arc<str>,
+    /// What it was read as.
+    pub format: Format,
+    /// What its beginning looks like, in words.
+    pub looks_like: String,
+}
+
 /// A trace being read: an iterator of records and issues in the file's order. Memory does not grow with
 /// the file.
 pub struct TraceReader {
@@ -59,6 +73,11 @@ pub struct TraceReader {
     notes: LeftOut,
     left_out: LeftOut,
     ended: bool,
+    /// How many were decoded.
+    records: u64,
+    /// The format that the name told, where the content told another one.
+    named: Option<Format>,
+    head: Vec<u8>,
 }
 
 /// What comes behind a batch of records.
@@ -75,6 +94,7 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
     let name = if path.as_os_str() == "-" { "standard input".to_owned() } else { path.display().to_string() };
     let failed = |error| OpenError::Io(name.clone(), error);
     let mut input = Input::open(path, options.follow).map_err(failed)?;
+    let mut named = None;
     let format = if let Some(format) = options.format {
         format
     } else {
@@ -83,13 +103,18 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
         match (Format::of_path(path), Format::of_content(head)) {
             // The logs of other programs share their suffixes with formats of ours.
             (_, Some(content)) if !content.is_written() => content,
+            (Ok(format), Some(content)) if !content.is_kind_of(format) => {
+                named = Some(format);
+                content
+            }
             (Ok(format), _) | (Err(_), Some(format)) => format,
             (Err(_), None) if path.as_os_str() == "-" => Format::Candump,
             (Err(unknown), None) => return Err(unknown.into()),
         }
     };
     input.set_zone(options.zone.clone());
-    Ok(TraceReader::new(name.into(), format, input, options.strict))
+    let reader = TraceReader::new(name.into(), format, input, options.strict);
+    Ok(TraceReader { named, ..reader })
 }
 
 impl TraceReader {
@@ -113,6 +138,7 @@ impl TraceReader {
             Format::Printer => Box::new(Rows::<printer::Decoder>::default()),
         };
         let batch = Vec::with_capacity(BATCH);
+        let head = input.buffered().iter().take(content::HEAD_BYTES).copied().collect();
         Self {
             name,
             format,
@@ -126,6 +152,9 @@ impl TraceReader {
             notes: LeftOut::default(),
             left_out: LeftOut::default(),
             ended: false,
+            records: 0,
+            named: None,
+            head,
         }
     }
 
@@ -144,6 +173,26 @@ impl TraceReader {
     /// The file's format.
     pub fn format(&self) -> Format {
         self.format
+    }
+
+    /// The format that the file's name tells, where its content was clearly another one, which it is read as.
+    pub fn named_otherwise(&self) -> Option<Format> {
+        self.named
+    }
+
+    /// How many records have been decoded so far, some of which may not have been handed out.
+    pub fn records(&self) -> u64 {
+        self.records
+    }
+
+    /// Whether nothing of the file could be read so far although there is something in it.
+    pub fn nothing_read(&self) -> Option<NothingRead> {
+        let something = self.issues > 0 || !self.left_out.is_empty();
+        (self.records == 0 && something).then(|| NothingRead {
+            file: self.name.clone(),
+            format: self.format,
+            looks_like: content::looks_like(&self.head, self.format),
+        })
     }
 
     /// While waiting for more of a file that is followed, ends as soon as this is true.
@@ -189,10 +238,12 @@ impl TraceReader {
             self.batch.clear();
             self.at = 0;
             self.after = self.decoder.batch(&mut self.input, &mut self.batch).transpose();
+            self.records += self.batch.len() as u64;
             return Beyond::Batch;
         };
         match after {
             Ok(Found::Record(record)) => {
+                self.records += 1;
                 self.batch.push(record);
                 Beyond::Batch
             }
@@ -200,7 +251,8 @@ impl TraceReader {
                 self.notes.note(what);
                 Beyond::Batch
             }
-            Ok(Found::LeftOut(what)) => {
+            // Nothing is wrong with it, only none of ours.
+            Ok(Found::LeftOut(what) | Found::Issue(_, Fault::Unsupported(Cow::Borrowed(what)))) => {
                 self.left_out.note(what);
                 Beyond::Batch
             }

@@ -242,7 +242,7 @@ mod tests {
             assert_eq!(
                 tests::write(Format::Candump, &records),
                 "(1639837704.597000) can0 00000100#0102\n\
-                 (1639837704.602000) can0 20000084#000C000000000000\n\
+                 (1639837704.602000) can0 20000004#000C000000000000\n\
                  (1639837704.603000) can0 200002A0#0000000000000908\n\
                  (1639837735.999000) can0 704#R1\n",
                 "{file}"
@@ -267,6 +267,18 @@ mod tests {
                 "test, line 8: expected a bus number, found nothing",
             ]
         );
+        for row in [
+            "1 1.0 D7 1 0100 Rx - 0",
+            "1 1.0 T 1 0100 Rx - 0",
+            "1 1.0 DTX 1 0100 Rx - 0",
+            "1 1.0 R 1 0100 Rx - 0",
+            "1 1.0 DT 1 0100 Px - 0",
+            "1 1.0 DT 1 0100 Rx - 1 00 01",
+        ] {
+            let file = format!(";$FILEVERSION=2.1\r\n;$STARTTIME=44548.6\r\n{row}\r\n");
+            let (records, issues) = tests::read(Format::Trc(TrcVersion::V2_1), file);
+            assert_eq!((records.len(), issues.len()), (0, 1), "{row}: {issues:?}");
+        }
     }
 
     #[test]

@@ -8,7 +8,7 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::{TraceEvent, TraceFrame, TraceRecord};
+use crate::{CHANNEL_0, Interface, TraceEvent, TraceFrame, TraceRecord};
 
 /// The flag of an extended identifier, as on Linux.
 pub const EXTENDED: u32 = 1 << 31;
@@ -125,6 +125,9 @@ fn interface(text: &str) -> Result<Option<u8>, ParseFilterError> {
     if text.is_empty() || text == "any" {
         return Ok(None);
     }
+    if text == CHANNEL_0 {
+        return Ok(Some(0));
+    }
     let letters = text.trim_end_matches(|c: char| c.is_ascii_digit());
     let channel = text[letters.len()..].parse::<u8>().ok().and_then(|number| number.checked_add(1));
     match channel {
@@ -162,7 +165,7 @@ impl FromStr for Filter {
 impl fmt::Display for Filter {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self.channel {
-            Some(channel) => write!(f, "can{}", channel.saturating_sub(1))?,
+            Some(channel) => write!(f, "{}", Interface(channel))?,
             None => f.write_str("any")?,
         }
         for IdFilter { id, mask, inverse } in &self.ids {
@@ -239,7 +242,9 @@ mod tests {
 
     #[test]
     fn text_round_trips() {
-        for text in ["any", "can0", "can1,123:7FF,00000123~DFFFFFFF,#FF,j", "any,7FF:C00007FF"] {
+        for text in
+            ["any", "can0", "channel0,123:7FF", "can1,123:7FF,00000123~DFFFFFFF,#FF,j", "any,7FF:C00007FF"]
+        {
             assert_eq!(text.parse::<Filter>().unwrap().to_string(), text);
         }
     }

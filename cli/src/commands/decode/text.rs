@@ -3,14 +3,14 @@
 use std::io::{self, Write};
 
 use cantap_signals::{Message, SignalValue};
+use cantap_trace::Interface;
 
 use super::decoded::{Decoded, Reading, Seconds};
 
 pub fn write(out: &mut impl Write, decoded: &Decoded) -> io::Result<()> {
     let Decoded { record, frame, message, values, .. } = decoded;
-    // candump numbers interfaces from 0.
-    let interface = record.channel.saturating_sub(1);
-    write!(out, "({}) can{interface} {} {}:", Seconds(record.time_ns), frame.id(), message.name)?;
+    let interface = Interface(record.channel);
+    write!(out, "({}) {interface} {} {}:", Seconds(record.time_ns), frame.id(), message.name)?;
     write_values(out, message, values)?;
     writeln!(out)
 }

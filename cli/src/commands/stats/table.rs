@@ -4,8 +4,10 @@ use std::fmt::Write as _;
 
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
+use crate::input::Missing;
+
 /// Everything, for a terminal of any width above eighty columns.
-pub(super) fn text(summary: &Summary, per_id: bool) -> String {
+pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {
     let mut out = String::new();
     // Writing to a String cannot fail.
     let _ = writeln!(
@@ -18,6 +20,9 @@ pub(super) fn text(summary: &Summary, per_id: bool) -> String {
         summary.lost,
         summary.errors,
     );
+    if let Some(words) = missing.in_words() {
+        let _ = writeln!(out, "not in these figures: {words}");
+    }
     for channel in &summary.channels {
         channel_text(channel, summary, &mut out);
         if per_id {

@@ -13,7 +13,7 @@ use super::super::issue::Fault;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
-use super::{FD_FORMAT, REMOTE, STATES};
+use super::{FD_FORMAT, REMOTE, STATES, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 
@@ -34,19 +34,33 @@ pub(crate) struct Decoder {
 }
 
 /// What a line is.
-enum Content {
+pub(super) enum Content {
     Record(TraceRecord),
     /// A request to send: if it gets through, a Tx line follows.
     Request,
-    /// Part of the file's head, or an event of no interest.
+    /// A known thing that is no part of a trace of CAN, by kind.
+    LeftOut(&'static str),
+    /// Part of the file's frame, which nobody misses.
     Other,
 }
 
-/// What a line on a classical channel is.
-enum Classical {
+/// What a line on a channel of CAN is.
+pub(super) enum OnChannel {
     Event(TraceEvent),
+    /// A request to send: if it gets through, a Tx line follows.
     Request,
-    Other,
+    /// A known thing that is no part of a trace, by kind.
+    LeftOut(&'static str),
+}
+
+impl OnChannel {
+    fn on(self, time_ns: i64, channel: u8) -> Content {
+        match self {
+            Self::Event(event) => Content::Record(TraceRecord { time_ns, channel, event }),
+            Self::Request => Content::Request,
+            Self::LeftOut(what) => Content::LeftOut(what),
+        }
+    }
 }
 
 /// Whether `line` begins with `word`, in any case.
@@ -77,6 +91,8 @@ impl Decode for Decoder {
                 Ok(Content::Record(record)) => return Ok(Found::Record(record)),
                 Ok(Content::Request) => return Ok(Found::Note(REQUESTS_TO_SEND)),
                 // The beginning of an event can look like one of no interest.
+                Ok(Content::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
+                Ok(Content::LeftOut(what)) => return Ok(Found::LeftOut(what)),
                 Ok(Content::Other) if !line.terminated && !is_footer(text) => return Ok(line.cut()),
                 Ok(Content::Other) => {}
                 Err(fault) => return Ok(line.issue(fault)),
@@ -156,37 +172,32 @@ impl Decoder {
     #[inline]
     fn event(&mut self, offset_ns: i64, rest: &[u8]) -> Result<Content, Fault> {
         let time_ns = self.time(offset_ns);
-        let (first, rest) = text::word(rest);
+        let (first, behind) = text::word(rest);
         if let Some(channel) = channel(first) {
-            return Ok(match self.classical(rest)? {
-                Classical::Event(event) => record(time_ns, channel, event),
-                Classical::Request => Content::Request,
-                Classical::Other => Content::Other,
-            });
+            return Ok(self.classical(behind)?.on(time_ns, channel));
         }
-        let (second, rest) = text::word(rest);
-        let Some(channel) = channel(second) else { return Ok(Content::Other) };
-        let event = match first {
-            b"CAN" => status(rest),
-            b"CANFD" => Some(self.flexible(rest)?),
-            _ => None,
-        };
-        Ok(event.map_or(Content::Other, |event| record(time_ns, channel, event)))
+        if !matches!(first, b"CAN" | b"CANFD") {
+            return others::kind(rest.trim_ascii());
+        }
+        let (second, behind) = text::word(behind);
+        let channel = channel(second).ok_or_else(|| Fault::malformed("a channel of 0 to 255", second))?;
+        let found = if first == b"CAN" { status(behind)? } else { self.flexible(behind)? };
+        Ok(found.on(time_ns, channel))
     }
 
     /// An event on a classical channel, behind the channel's number.
     #[inline]
-    fn classical(&self, rest: &[u8]) -> Result<Classical, Fault> {
+    fn classical(&self, rest: &[u8]) -> Result<OnChannel, Fault> {
         let (id, rest) = text::word(rest);
         if id.eq_ignore_ascii_case(b"ErrorFrame") {
-            return Ok(Classical::Event(error_frame(rest)));
+            return Ok(OnChannel::Event(error_frame(rest)));
         }
-        let Some((raw, extended)) = self.identifier(id) else { return Ok(Classical::Other) };
+        let Some((raw, extended)) = self.identifier(id) else { return others::on_channel(id) };
         let (word, rest) = text::word(rest);
         let direction = match word {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
-            b"TxRq" => return Ok(Classical::Request),
+            b"TxRq" => return Ok(OnChannel::Request),
             _ => return Err(Fault::malformed("'Rx' or 'Tx' behind the identifier", word)),
         };
         let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
@@ -208,7 +219,7 @@ impl Decoder {
             }
             other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
         };
-        Ok(Classical::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
+        Ok(OnChannel::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
     }
 
     /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
@@ -222,17 +233,18 @@ impl Decoder {
     }
 
     /// An event on a CAN FD channel, which may be a classical frame.
-    fn flexible(&self, rest: &[u8]) -> Result<TraceEvent, Fault> {
+    fn flexible(&self, rest: &[u8]) -> Result<OnChannel, Fault> {
         let mut words = rest.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
         let mut next = || words.next().unwrap_or_default();
         let direction = match next() {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
+            b"TxRq" => return Ok(OnChannel::Request),
             other => return Err(Fault::malformed("'Rx' or 'Tx' behind the channel", other)),
         };
         let word = next();
         if word.eq_ignore_ascii_case(b"ErrorFrame") {
-            return Ok(TraceEvent::BusError { kind: None, counters: None });
+            return Ok(OnChannel::Event(TraceEvent::BusError { kind: None, counters: None }));
         }
         let parsed = self.identifier(word);
         let id =
@@ -283,7 +295,7 @@ impl Decoder {
                 format!("{dlc:x} {len}").as_bytes(),
             )
         })?;
-        Ok(TraceEvent::Frame { frame, direction, late: false })
+        Ok(OnChannel::Event(TraceEvent::Frame { frame, direction, late: false }))
     }
 
     #[inline]
@@ -327,12 +339,13 @@ impl Decoder {
             *slot = self.byte(word).ok_or_else(fault)?;
             rest = after;
         }
+        // Further columns follow, but no byte: then the length would be wrong.
+        let (word, _) = text::word(rest);
+        if self.byte(word).is_some() {
+            return Err(Fault::malformed(format!("{len} data bytes"), columns.trim_ascii()));
+        }
         Ok(data)
     }
-}
-
-fn record(time_ns: i64, channel: u8, event: TraceEvent) -> Content {
-    Content::Record(TraceRecord { time_ns, channel, event })
 }
 
 #[inline]
@@ -357,25 +370,30 @@ fn error_frame(rest: &[u8]) -> TraceEvent {
     TraceEvent::BusError { kind: code.and_then(sja1000::kind), counters: None }
 }
 
-/// A status line, behind the channel.
-fn status(rest: &[u8]) -> Option<TraceEvent> {
-    let status = rest.trim_ascii().strip_prefix(b"Status:")?;
+/// A line that begins with `CAN` and a channel: the controller's status.
+fn status(rest: &[u8]) -> Result<OnChannel, Fault> {
+    let rest = rest.trim_ascii();
+    let Some(status) = rest.strip_prefix(b"Status:") else {
+        return others::on_channel(text::word(rest).0);
+    };
     if let Some(event) = event_text::marked(status) {
-        return Some(event);
+        return Ok(OnChannel::Event(event));
     }
     let status = String::from_utf8_lossy(status).to_ascii_lowercase();
     if status.contains("overrun") {
-        return Some(TraceEvent::Lost { stage: None, count: 1, at_least: true });
+        return Ok(OnChannel::Event(TraceEvent::Lost { stage: None, count: 1, at_least: true }));
     }
     // Files spell these in more than one way.
     let status = status.replace("busoff", "bus off").replace("warning level", "warning limit");
-    let (state, _) = STATES.iter().find(|(_, text)| status.starts_with(text))?;
+    let Some((state, _)) = STATES.iter().find(|(_, text)| status.starts_with(text)) else {
+        return Ok(OnChannel::LeftOut("other states of the controller"));
+    };
     let counter = |name: &str| {
         let (_, rest) = status.split_once(name)?;
         rest.split_ascii_whitespace().next()?.parse().ok()
     };
     let counters = counter("txerr:").zip(counter("rxerr:"));
-    Some(TraceEvent::State { state: *state, counters })
+    Ok(OnChannel::Event(TraceEvent::State { state: *state, counters }))
 }
 
 /// `Sat Sep 30 15:06:13.191 2017`, also with am or pm before the year, also in German.

@@ -1,7 +1,6 @@
 //! Writing pcapng.
 
 use super::super::codec::Encode;
-use super::super::interfaces;
 use super::super::left_out::LeftOut;
 use super::super::socketcan_packet::{EXTENDED, FD_PACKET_BYTES, LINK_TYPE, PACKET_BYTES, REMOTE};
 use super::{
@@ -67,7 +66,7 @@ impl Encoder {
             out.extend_from_slice(&LINK_TYPE.to_le_bytes());
             // Reserved, and no limit to a packet's length.
             out.extend_from_slice(&[0; 6]);
-            option(out, IF_NAME, format!("can{}", interfaces::number(channel)).as_bytes());
+            option(out, IF_NAME, cantap_trace::Interface(channel).to_string().as_bytes());
             option(out, IF_TSRESOL, &[RESOLUTION]);
             option(out, END, &[]);
         });

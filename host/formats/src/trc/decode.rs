@@ -27,11 +27,21 @@ pub(crate) struct Decoder {
     version: TrcVersion,
     start_ns: i64,
     has_start: bool,
+    has_rows: bool,
     layout: Layout,
     /// The row before told an event exactly; a row of the format's own for it follows.
     told: Option<TraceRecord>,
     /// Of the dates.
     zone: Zone,
+}
+
+/// What a row is.
+enum Row {
+    Record(TraceRecord),
+    /// A known thing that is no part of a trace of CAN, by kind.
+    LeftOut(&'static str),
+    /// Of the head, or told by the row before.
+    Nothing,
 }
 
 /// Which column has what, counted from 0.
@@ -92,6 +102,7 @@ impl Default for Decoder {
             version,
             start_ns: 0,
             has_start: false,
+            has_rows: false,
             layout: Layout::of(version),
             told: None,
             zone: Zone::default(),
@@ -111,9 +122,18 @@ impl Decode for Decoder {
         while let Some(line) = input.line()? {
             let text = line.text.trim_ascii();
             let result = match text {
-                [] => Ok(None),
-                [b';', comment @ ..] => self.head(comment).map(|()| None),
+                [] => Ok(Row::Nothing),
+                // Behind the head nobody looks for more of it: a row may have become a comment by damage.
+                [b';', ..] if self.has_rows => Ok(Row::LeftOut("comments and texts")),
+                [b';', comment @ ..] => self.head(comment).map(|()| Row::Nothing),
                 _ => self.row(text),
+            };
+            let result = match result {
+                Ok(Row::LeftOut(_)) if !line.terminated => return Ok(line.cut()),
+                Ok(Row::LeftOut(what)) => return Ok(Found::LeftOut(what)),
+                Ok(Row::Record(record)) => Ok(Some(record)),
+                Ok(Row::Nothing) => Ok(None),
+                Err(fault) => Err(fault),
             };
             match result {
                 Ok(row)
@@ -171,7 +191,8 @@ impl Decoder {
         Ok(())
     }
 
-    fn row(&mut self, row: &[u8]) -> Result<Option<TraceRecord>, Fault> {
+    fn row(&mut self, row: &[u8]) -> Result<Row, Fault> {
+        self.has_rows = true;
         let mut columns: [&[u8]; MAX_COLUMNS] = [b""; MAX_COLUMNS];
         let mut rest = row;
         for column in &mut columns[..self.layout.data.min(MAX_COLUMNS)] {
@@ -189,11 +210,19 @@ impl Decoder {
                 columns[layout.id] != WARNING_ID && !rest.trim_ascii().starts_with(b"ERROR")
             }
             b"Rx" | b"Tx" if self.version < TrcVersion::V2_0 => true,
-            b"DT" | b"RR" | b"FD" | b"FB" | b"FE" | b"BI" => true,
-            _ => false,
+            b"Warng" | b"Error" if self.version < TrcVersion::V2_0 => false,
+            b"DT" | b"RR" | b"FD" | b"FB" | b"FE" | b"BI" if self.version >= TrcVersion::V2_0 => true,
+            b"ST" | b"ER" | b"EC" | b"EV" if self.version >= TrcVersion::V2_0 => false,
+            other if self.version < TrcVersion::V2_0 => {
+                return Err(Fault::malformed("a row's type: Rx, Tx, Warng or Error", other));
+            }
+            other => {
+                let expected = "a row's type: DT, RR, FD, FB, FE, BI, ST, ER, EC or EV";
+                return Err(Fault::malformed(expected, other));
+            }
         };
         if !frame_kind {
-            return Ok(self.event(row, kind, columns, time_ns, told));
+            return self.event(row, kind, columns, time_ns, told);
         }
         let bus = layout.bus.map(|at| columns[at]);
         let channel = match bus {
@@ -205,14 +234,15 @@ impl Decoder {
         let id = identifier(columns[layout.id])?;
         let direction = match layout.direction.map(|at| columns[at]) {
             Some(b"Tx") => Direction::Tx,
-            _ => Direction::Rx,
+            Some(b"Rx") | None => Direction::Rx,
+            Some(other) => return Err(Fault::malformed("'Rx' or 'Tx'", other)),
         };
         let len = columns[layout.len];
         if let b"FD" | b"FB" | b"FE" | b"BI" = kind {
             let (brs, esi) = (matches!(kind, b"FB" | b"BI"), matches!(kind, b"FE" | b"BI"));
             let frame = flexible(id, brs, esi, len, layout.len_is_bytes, rest)?;
             let event = TraceEvent::Frame { frame, direction, late: false };
-            return Ok(Some(TraceRecord { time_ns, channel, event }));
+            return Ok(Row::Record(TraceRecord { time_ns, channel, event }));
         }
         let dlc = text::decimal(len)
             .filter(|dlc| *dlc <= 15)
@@ -230,10 +260,13 @@ impl Decoder {
                 .ok_or_else(|| Fault::malformed(format!("{} data bytes", dlc.min(8)), rest.trim_ascii()))?;
                 bytes = after;
             }
+            if !bytes.trim_ascii().is_empty() {
+                return Err(Fault::malformed(format!("{} data bytes", dlc.min(8)), rest.trim_ascii()));
+            }
         }
         let frame = Frame::from_bus(id, remote, dlc, data);
         let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
-        Ok(Some(TraceRecord { time_ns, channel, event }))
+        Ok(Row::Record(TraceRecord { time_ns, channel, event }))
     }
 
     /// A row that is no frame. Those of no interest give nothing.
@@ -244,26 +277,33 @@ impl Decoder {
         columns: [&[u8]; MAX_COLUMNS],
         time_ns: i64,
         told: Option<TraceRecord>,
-    ) -> Option<TraceRecord> {
+    ) -> Result<Row, Fault> {
         if let Some(event) = event_text::marked(row) {
             let record = TraceRecord { time_ns, channel: named_channel(row), event };
             if self.version >= TrcVersion::V2_0 {
                 self.told = Some(record);
             }
-            return Some(record);
+            return Ok(Row::Record(record));
         }
         let channel = self.layout.bus.and_then(|at| text::decimal(columns[at]));
         let channel = channel.and_then(|bus| u8::try_from(bus).ok()).unwrap_or(1);
         let bytes = data_bytes(row, self.version >= TrcVersion::V2_0);
+        let wrong = || Fault::malformed("the bytes of a warning, an error or a status", row);
         let event = match (kind, &bytes[..]) {
             // Version 1 has the type in the identifier's place.
             (b"Error" | b"", [_, position, rec, tec, ..]) if columns[self.layout.id] != WARNING_ID => {
-                error_of(text::hex(columns[self.layout.id])?, *position, (*tec, *rec))
+                let class = text::hex(columns[self.layout.id]).ok_or_else(wrong)?;
+                error_of(class, *position, (*tec, *rec))
             }
             (b"ER", [class, _, position, rec, tec, ..]) => {
                 error_of(u32::from(*class), *position, (*tec, *rec))
             }
-            (b"Warng" | b"ST" | b"", [a, b, c, d, ..]) => event_of(u32::from_be_bytes([*a, *b, *c, *d]))?,
+            (b"Warng" | b"ST" | b"", [a, b, c, d, ..]) => {
+                match event_of(u32::from_be_bytes([*a, *b, *c, *d])) {
+                    Some(event) => event,
+                    None => return Ok(Row::LeftOut("states of PEAK's hardware and driver")),
+                }
+            }
             (b"EC", [rec, tec, ..]) => {
                 let state = match tec.max(rec) {
                     128.. => ErrorState::Passive,
@@ -272,14 +312,15 @@ impl Decoder {
                 };
                 TraceEvent::State { state, counters: Some((*tec, *rec)) }
             }
-            _ => return None,
+            (b"EV", _) => return Ok(Row::LeftOut("comments and texts")),
+            _ => return Err(wrong()),
         };
         let record = TraceRecord { time_ns, channel, event };
         let same = |told: TraceRecord| {
             told.time_ns == time_ns
                 && std::mem::discriminant(&told.event) == std::mem::discriminant(&record.event)
         };
-        (!told.is_some_and(same)).then_some(record)
+        Ok(if told.is_some_and(same) { Row::Nothing } else { Row::Record(record) })
     }
 }
 

@@ -1,0 +1,163 @@
+//! What cannot be read is no success, whatever the command, and nothing is left out without being told.
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// An empty directory for each test.
+fn directory(test: &str) -> PathBuf {
+    let directory = Path::new(env!("CARGO_TARGET_TMPDIR")).join("nothing_read").join(test);
+    let _ = fs::remove_dir_all(&directory);
+    fs::create_dir_all(&directory).unwrap();
+    directory
+}
+
+fn cantap(directory: &Path, arguments: &[&str]) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    let output = command.args(arguments).current_dir(directory).output().unwrap();
+    let text = |bytes: Vec<u8>| String::from_utf8(bytes).unwrap();
+    (output.status.code(), text(output.stdout), text(output.stderr))
+}
+
+const DATABASE: &str = "VERSION \"\"\nBO_ 291 A: 8 X\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" X\n";
+
+#[test]
+fn every_command_fails_where_nothing_could_be_read_and_says_what_the_file_looks_like() {
+    let directory = directory("commands");
+    fs::write(directory.join("diary.log"), "dear diary\n".repeat(30)).unwrap();
+    fs::write(directory.join("other.log"), "(1.000000) can0 123#11\n").unwrap();
+    fs::write(directory.join("car.dbc"), DATABASE).unwrap();
+    for arguments in [
+        &["convert", "diary.log", "new.asc"][..],
+        &["stats", "diary.log"],
+        &["stats", "diary.log", "--json"],
+        &["diff", "diary.log", "diary.log", "--check"],
+        &["diff", "other.log", "diary.log"],
+        &["search", "diary.log", "--id", "123"],
+        &["decode", "--db", "car.dbc", "diary.log"],
+        &["plot", "--db", "car.dbc", "--signal", "S", "diary.log", "-o", "plot.svg"],
+    ] {
+        let (code, out, err) = cantap(&directory, arguments);
+        assert_eq!(code, Some(1), "{arguments:?}: {out}{err}");
+        let says = "nothing in diary.log could be read as candump; it looks like text that begins with 'dear diary'; \
+                    if it is a trace, name its format with --from";
+        assert!(err.contains(says), "{arguments:?}: {err}");
+        assert!(err.contains("expected a log line such as"), "{err}");
+        assert!(!out.contains("equal") && !out.contains("frames"), "{arguments:?}: {out}");
+    }
+    let (code, _, err) = cantap(&directory, &["align", "other.log", "diary.log", "-o", "aligned.log"]);
+    assert!(code == Some(1) && err.contains("diary.log: no frame could be read"), "{code:?} {err}");
+    let mut made: Vec<_> =
+        fs::read_dir(&directory).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    made.sort();
+    assert_eq!(made, ["car.dbc", "diary.log", "other.log"]);
+}
+
+#[test]
+fn an_older_output_stays_as_it_is_where_nothing_can_be_read() {
+    let directory = directory("older");
+    fs::write(directory.join("broken.csv"), "a,b\n1,2\n").unwrap();
+    fs::write(directory.join("out.log"), "older\n").unwrap();
+    let (code, _, err) = cantap(&directory, &["convert", "broken.csv", "out.log"]);
+    assert_eq!(code, Some(1), "{err}");
+    assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "older\n");
+    // A trace without any frame is one all the same, and takes the older one's place.
+    fs::write(directory.join("empty.log"), "").unwrap();
+    let (code, _, err) = cantap(&directory, &["convert", "empty.log", "out.log"]);
+    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "");
+    assert_eq!(fs::read_dir(&directory).unwrap().count(), 3, "nothing temporary is left");
+}
+
+#[test]
+fn what_was_read_until_a_strict_end_takes_the_outputs_place_whole() {
+    let directory = directory("strict");
+    fs::write(directory.join("in.log"), "(1.000000) can0 123#11\nrubbish\n(2.000000) can0 123#11\n").unwrap();
+    fs::write(directory.join("out.log"), "older\n").unwrap();
+    let (code, _, _) = cantap(&directory, &["convert", "in.log", "out.log", "--strict"]);
+    assert_eq!(code, Some(1));
+    assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "(1.000000) can0 123#11\n");
+}
+
+#[test]
+fn content_decides_where_it_is_clear_and_from_overrides() {
+    let directory = directory("content");
+    let log = "(1410714882.000000) can0 123#1122\n(1410714883.000000) can1 1F334455#AA T\n";
+    fs::write(directory.join("a.log"), log).unwrap();
+    for (format, wrong) in
+        [("asc", "as.log"), ("blf", "is.asc"), ("pcapng", "is.log"), ("candump", "is.trc"), ("trc", "is.csv")]
+    {
+        let (code, _, err) = cantap(&directory, &["convert", "a.log", wrong, "--format", format]);
+        assert_eq!(code, Some(0), "{err}");
+        let (code, out, err) = cantap(&directory, &["convert", wrong, "-"]);
+        assert_eq!((code, out.as_str()), (Some(0), log), "{wrong}: {err}");
+        assert!(err.contains(&format!("{wrong} is read as {format}, which its content is")), "{err}");
+        assert!(err.contains("--from overrides"), "{err}");
+        let (code, out, err) = cantap(&directory, &["convert", wrong, "-", "--from", "dif"]);
+        assert_eq!((code, out.as_str()), (Some(1), ""), "{wrong}: {err}");
+    }
+    fs::copy(directory.join("a.log"), directory.join("name.xyz")).unwrap();
+    fs::write(directory.join("rubbish.xyz"), "rubbish\n").unwrap();
+    let (code, _, err) = cantap(&directory, &["stats", "rubbish.xyz"]);
+    assert!(code == Some(1) && err.contains("name it with one of --from "), "{err}");
+}
+
+#[test]
+fn what_is_left_out_is_told_by_kind_with_its_share_and_is_in_the_json() {
+    let directory = directory("left_out");
+    let head = "date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\ninternal events logged\n";
+    let frames = "0.1 1 123 Rx d 1 11\n".repeat(6);
+    let lin = "0.2 L1 3e Rx 1 00\n".repeat(3);
+    let broken = "0.3 1 12G Rx d 0\n";
+    fs::write(directory.join("mixed.asc"), format!("{head}{frames}{lin}{broken}")).unwrap();
+    let words = "1 place could not be read; no part of a CAN trace: LIN frames and events (3); 40.0 % of the file left out";
+    let (code, out, err) = cantap(&directory, &["stats", "mixed.asc"]);
+    assert_eq!(code, Some(0));
+    assert!(out.contains(&format!("not in these figures: {words}")), "{out}");
+    assert!(err.contains(words), "{err}");
+    for arguments in [
+        &["stats", "mixed.asc", "--json"][..],
+        &["convert", "mixed.asc", "out.log", "--json"],
+        &["diff", "mixed.asc", "mixed.asc", "--json"],
+    ] {
+        let (_, out, _) = cantap(&directory, arguments);
+        let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+        let times = if arguments[0] == "diff" { 2 } else { 1 };
+        assert_eq!(object["issues"], times, "{out}");
+        assert_eq!(object["left_out"]["LIN frames and events"], 3 * times, "{out}");
+        let share = &object["missing_pct"];
+        let share = share.as_f64().or_else(|| share[0].as_f64()).unwrap();
+        assert!((share - 40.0).abs() < 1e-9, "{out}");
+    }
+}
+
+#[test]
+fn fd_frames_have_their_load_only_with_the_data_bit_rate() {
+    let directory = directory("fd");
+    // 17 bits of arbitration, no stuff bit in it, 12 behind the data phase; 500 kbit/s, one frame in a millisecond.
+    let frame = format!("2AA##1{}", "AA".repeat(64));
+    let line = |at: u32| format!("(1.{:06}) can0 {frame}\n", at * 1000);
+    fs::write(directory.join("fd.log"), (0..10).map(line).collect::<String>()).unwrap();
+    let load = |arguments: &[&str]| {
+        let (code, out, err) = cantap(&directory, &[&["stats", "fd.log", "--json"], arguments].concat());
+        assert_eq!(code, Some(0), "{err}");
+        let object: serde_json::Value = serde_json::from_str(&out).unwrap();
+        (object["channels"][0]["bus_load_pct"].as_f64(), object["channels"][0]["fd"].as_u64())
+    };
+    assert_eq!(load(&["-b", "500k"]), (None, Some(10)));
+    let (_, out, _) = cantap(&directory, &["stats", "fd.log", "-b", "500k"]);
+    assert!(
+        out.contains("10 frames (10 with a switched bit rate") && out.contains("--data-bitrate"),
+        "{out}"
+    );
+    let (_, out, _) = cantap(&directory, &["bits", &frame, "-b", "500k", "--data-bitrate", "2M", "--json"]);
+    let bits: serde_json::Value = serde_json::from_str(&out).unwrap();
+    // 5 + 512 + 4 + 21 + 7 + 1, and what stuff bits the length code 1111 has with its neighbours.
+    let (nominal, data) = (bits["nominal_bits"].as_u64().unwrap(), bits["data_phase_bits"].as_u64().unwrap());
+    assert_eq!((nominal, data), (29, 550 + bits["stuff_bits"].as_u64().unwrap()));
+    let expected = (nominal as f64 / 500e3 + data as f64 / 2e6) / 1e-3 * 100.0;
+    let (found, _) = load(&["-b", "500k", "--data-bitrate", "2M"]);
+    assert!((found.unwrap() - expected).abs() < 1e-6, "{found:?} {expected}");
+    let (found, _) = load(&["-b", "500k", "--data-bitrate", "1:4M", "--data-bitrate", "2M"]);
+    assert!(found.unwrap() < expected, "{found:?}");
+}

@@ -1,0 +1,69 @@
+//! What else stands in ASC files: other buses, and what the measuring program has to say. Everything known is counted by its
+//! kind; what is not known is an issue, for it may be a frame with a damaged line.
+
+use super::super::issue::Fault;
+use super::super::text;
+use super::decode::{Content, OnChannel};
+
+/// Events by the word behind their time.
+const KINDS: [(&[&str], &str); 11] = [
+    (&["ETH"], "Ethernet frames and events"),
+    (&["Fr", "FR", "FlexRay"], "FlexRay frames and events"),
+    (&["Li"], "LIN frames and events"),
+    (&["SV:", "EV:"], "environment and system variables"),
+    (&["CANXL"], "CAN XL frames"),
+    (&["Comment:", "Comment", "GMARKER", "AMARKER", "Marker"], "comments and texts"),
+    (&["log", "Log", "trigger", "Trigger"], "triggers and markers"),
+    (&["TFS:", "Diag", "DIAG"], "diagnostics and tests"),
+    (&["J1587", "J1708"], "J1708 frames"),
+    (&["AFDX", "A429"], "AFDX and ARINC 429 frames and events"),
+    (&["WLAN", "GPS", "GPS:"], "WLAN and GPS events"),
+];
+
+/// A line behind its time that belongs to no channel of CAN.
+pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
+    let (first, rest) = text::word(line);
+    if line.to_ascii_lowercase().starts_with(b"start of measurement") {
+        return Ok(Content::Other);
+    }
+    if first.starts_with(b"//") {
+        return Ok(Content::LeftOut("comments and texts"));
+    }
+    if let Some((_, what)) =
+        KINDS.iter().find(|(words, _)| words.iter().any(|known| known.as_bytes() == first))
+    {
+        return Ok(Content::LeftOut(what));
+    }
+    // Channels of LIN and MOST have their number behind the letters.
+    let numbered = |letters: &[u8]| {
+        let number = first.strip_prefix(letters);
+        number.is_some_and(|number| !number.is_empty() && number.iter().all(u8::is_ascii_digit))
+    };
+    if numbered(b"L") || numbered(b"LIN") || numbered(b"Li") {
+        return Ok(Content::LeftOut("LIN frames and events"));
+    }
+    if first.starts_with(b"MOST") || numbered(b"M") {
+        return Ok(Content::LeftOut("MOST frames and events"));
+    }
+    // `name := value`.
+    if text::word(rest).0 == b":=" {
+        return Ok(Content::LeftOut("environment and system variables"));
+    }
+    let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC behind the time";
+    Err(Fault::malformed(expected, line))
+}
+
+/// A line on a channel of CAN that is neither a frame nor an error: `word` stands in the place of the identifier.
+pub(super) fn on_channel(word: &[u8]) -> Result<OnChannel, Fault> {
+    Ok(OnChannel::LeftOut(match word {
+        b"Statistic:" | b"Statistic" => "CAN statistics",
+        b"OverloadFrame" => "CAN overload frames",
+        b"J1939TP" => "J1939 transport events, made of frames that are in the trace",
+        _ => {
+            return Err(Fault::malformed(
+                "an identifier in hexadecimal digits (decimal with base dec)",
+                word,
+            ));
+        }
+    }))
+}

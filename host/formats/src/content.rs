@@ -1,0 +1,65 @@
+//! What the beginning of a file looks like, in words, for whoever gave the wrong one.
+
+use super::Format;
+
+/// Bytes that are looked at.
+pub(crate) const HEAD_BYTES: usize = 256;
+
+/// Other things that are taken for traces, by their first bytes.
+const KNOWN: [(&[u8], &str); 12] = [
+    (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
+    (b"%PDF", "a PDF document"),
+    (b"\x7FELF", "a program"),
+    (b"SQLite format 3", "an SQLite database"),
+    (b"\x89PNG", "a picture"),
+    (b"7z\xBC\xAF\x27\x1C", "a 7z archive"),
+    (b"BZh", "a bzip2 archive"),
+    (b"VERSION \"", "a DBC database"),
+    (b"<", "XML or HTML"),
+    (b"{", "JSON"),
+    (b"[", "JSON or settings"),
+    (b"FormatVersion=", "a SYM database"),
+];
+
+/// What a file that begins so looks like. `read_as` is what it was taken for.
+pub(crate) fn looks_like(head: &[u8], read_as: Format) -> String {
+    let text = head.trim_ascii();
+    if text.is_empty() {
+        return if head.is_empty() { "an empty file" } else { "nothing but spaces" }.to_owned();
+    }
+    if let Some(format) = Format::of_content(head).filter(|format| !format.is_kind_of(read_as)) {
+        return format!("a trace in the format {format}");
+    }
+    if let Some((_, what)) = KNOWN.iter().find(|(begin, _)| text.starts_with(begin)) {
+        return (*what).to_owned();
+    }
+    let line = text.split(|byte| matches!(byte, b'\n' | b'\r')).next().unwrap_or_default();
+    if line.iter().any(|byte| *byte < b' ' && *byte != b'\t') {
+        let bytes: Vec<_> = head.iter().take(8).map(|byte| format!("{byte:02X}")).collect();
+        return format!("binary data that begins with {}", bytes.join(" "));
+    }
+    let line = String::from_utf8_lossy(line);
+    let shown: String = line.chars().filter(|character| !character.is_control()).take(60).collect();
+    let more = if shown.len() < line.len() { "…" } else { "" };
+    format!("text that begins with '{shown}{more}'")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_is_no_trace_is_told_in_words() {
+        for (head, words) in [
+            (&b""[..], "an empty file"),
+            (b"PK\x03\x04....", "a ZIP archive or spreadsheet"),
+            (b"(1.0) can0 123#11\n", "a trace in the format candump"),
+            (b"\0\x01\x02", "binary data that begins with 00 01 02"),
+            (b"dear diary\ntoday", "text that begins with 'dear diary'"),
+            (b"\xFF\xFEa", "text that begins with '\u{FFFD}\u{FFFD}a'"),
+        ] {
+            assert_eq!(looks_like(head, Format::Asc), words);
+        }
+        assert_eq!(looks_like(b"date nonsense", Format::Asc), "text that begins with 'date nonsense'");
+    }
+}

@@ -342,10 +342,10 @@ impl Encode for Encoder {
             }
             event => {
                 // Every event but a frame has an error frame. python-can takes one without this class for
-                // a frame on the bus; a change of state stays as the kernel has it all the same.
+                // a frame on the bus; bus-off stays as the kernel has it all the same.
                 if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
-                    let is_state = matches!(event, TraceEvent::State { .. });
-                    let class = if is_state { 0 } else { BUS_ERROR };
+                    let is_bus_off = classes & cantap_trace::socketcan::BUS_OFF != 0;
+                    let class = if is_bus_off { 0 } else { BUS_ERROR };
                     line.put(&text::hex_digits_of(ERROR_FLAG | class | classes));
                     line.put(b"#");
                     line.put(&text::hex_digits_of_eight(data));

@@ -12,6 +12,7 @@ use std::process::Command;
 
 use cantap_formats::{CsvDialect, Format, ReadOptions, TrcVersion, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
+use cantap_wire::record::ErrorState;
 use traces::{directory, file_name, frames, odd, read, real, split, write};
 
 const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
@@ -174,7 +175,10 @@ fn python_can_formats(start_us: i64) -> Vec<(Format, Carries)> {
 #[test]
 fn python_can_reads_every_record_of_the_files_we_write() {
     let directory = directory("python_can_reads");
-    let records = records_of_every_kind(&directory);
+    // A bus-off in candump's log stays as the kernel writes it, and python-can takes that for a frame.
+    let mut records = records_of_every_kind(&directory);
+    let off = TraceEvent::State { state: ErrorState::BusOff, counters: None };
+    records.retain(|record| record.event != off);
     let formats = python_can_formats(records[0].time_ns / 1000);
     let paths: Vec<_> = formats.iter().map(|(format, _)| directory.join(file_name(*format, ""))).collect();
     for ((format, _), path) in formats.iter().zip(&paths) {
@@ -408,10 +412,7 @@ const DIFFERENT: &[(&str, &str)] = &[
         "a remote frame in a CANFD row is a classical one; an error frame is nobody's to have sent",
     ),
     ("single_frame.asc", "64 bytes in a classical row are an issue here, a message there"),
-    (
-        "test_CanErrorFrameExt.blf",
-        "channel 4370 is shown as 255, the last; and a microsecond is rounded the other way",
-    ),
+    ("test_CanErrorFrameExt.blf", "channel 4370 is an issue; and a microsecond is rounded the other way"),
     ("test_CanErrorFrames.asc", "an error frame is nobody's to have sent"),
     ("test_CanFdMessage.blf", "channel 4370 is an issue here"),
     ("test_CanFdMessage64.blf", "an identifier of 31 bits is an issue here"),

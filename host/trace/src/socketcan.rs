@@ -18,7 +18,8 @@ const LOST_ARBITRATION: u32 = 0x002;
 const CONTROLLER: u32 = 0x004;
 const PROTOCOL: u32 = 0x008;
 const NO_ACK: u32 = 0x020;
-const BUS_OFF: u32 = 0x040;
+/// The class of a controller that went off the bus.
+pub const BUS_OFF: u32 = 0x040;
 /// The class that python-can takes as the sign of an error frame.
 pub const BUS_ERROR: u32 = 0x080;
 const RESTARTED: u32 = 0x100;

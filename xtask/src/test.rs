@@ -59,7 +59,7 @@ enum Step {
     Kernel,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
-    /// The crates as they would be published: each packs, and builds from its package.
+    /// The crates as they would be published: each packs.
     Package,
 }
 

@@ -76,6 +76,11 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
+/// Whether a file's name or `--format` names no format, for reading or for writing.
+pub fn is_unknown_format(error: &(dyn Error + 'static)) -> bool {
+    unknown_format(error).is_some()
+}
+
 fn of_format(error: &UnknownFormat) -> Option<String> {
     matches!(error, UnknownFormat::Suffix(_))
         .then(|| format!("; name it with one of --format {}", Format::names()))

@@ -9,6 +9,9 @@ use cantap::wire::Refusal;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
+/// Where nothing could be read.
+const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
+
 /// An error and its causes as the user reads them, but for causes that the error itself tells already.
 pub fn sentence(error: &anyhow::Error) -> String {
     error.chain().fold(String::new(), |text, cause| {
@@ -30,7 +33,7 @@ pub fn told(error: &(dyn Error + 'static)) -> String {
         .downcast_ref()
         .and_then(of_device)
         .or_else(|| error.downcast_ref().and_then(of_timing))
-        .or_else(|| error.downcast_ref().map(of_nothing_read))
+        .or_else(|| error.downcast_ref().map(|_: &NothingRead| NAME_THE_FORMAT.to_owned()))
         .or_else(|| unknown_format(error).and_then(|unknown| of_format(unknown, option(error))));
     advice.map_or_else(|| error.to_string(), |advice| format!("{error}{advice}"))
 }
@@ -77,6 +80,11 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
+/// Whether a file's name or `--format` names no format, for reading or for writing.
+pub fn is_unknown_format(error: &(dyn Error + 'static)) -> bool {
+    unknown_format(error).is_some()
+}
+
 /// The option that names the format: of what is read, or of what is written.
 fn option(error: &(dyn Error + 'static)) -> &'static str {
     if error.is::<OpenError>() { "--from" } else { "--format" }
@@ -85,11 +93,6 @@ fn option(error: &(dyn Error + 'static)) -> &'static str {
 fn of_format(error: &UnknownFormat, option: &str) -> Option<String> {
     matches!(error, UnknownFormat::Suffix(_))
         .then(|| format!("; name it with one of {option} {}", Format::names()))
-}
-
-fn of_nothing_read(error: &NothingRead) -> String {
-    let _ = error;
-    "; if it is a trace, name its format with --from".to_owned()
 }
 
 /// The advice stands behind what is wrong, before the condition itself.

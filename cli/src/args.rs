@@ -3,6 +3,15 @@
 use std::time::Duration;
 
 use cantap::Channel;
+use cantap::wire::CHANNELS;
+
+use crate::wrong::wrong;
+
+/// Channels of all the devices that a command takes.
+pub const MOST_CHANNELS: u8 = 32;
+
+/// Below this, in bit/s, the k was forgotten. Controllers begin at 5000.
+const LEAST_BITRATE_BPS: f64 = 1_500.0;
 
 /// A bit rate in bit/s: `500000`, `500k`, `83.333k`, `1M`.
 pub fn bitrate(text: &str) -> Result<u32, String> {
@@ -15,6 +24,9 @@ pub fn bitrate(text: &str) -> Result<u32, String> {
     let digits = number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
     let value = if digits { number.parse::<f64>().map_err(|_| wrong())? } else { return Err(wrong()) };
     let bps = (value * factor).round();
+    if (1.0..LEAST_BITRATE_BPS).contains(&bps) {
+        return Err(format!("{text} bit/s is slower than any CAN bus; write {text}k for {text} kbit/s"));
+    }
     if (1.0..=f64::from(u32::MAX)).contains(&bps) { Ok(bps as u32) } else { Err(wrong()) }
 }
 
@@ -52,25 +64,77 @@ pub fn percent(text: &str) -> Result<f64, String> {
         .ok_or_else(|| "give per cent, above 0 and up to 100".to_owned())
 }
 
-/// Channels of a device, as `1`, `2` or `both`.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Channels(&'static [Channel]);
+/// Channels, as `1`, `2`, several with commas, or `both`, which is all there are.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Channels {
+    /// From 1; none for all.
+    numbers: Vec<u8>,
+}
 
 impl Channels {
-    /// One by one.
-    pub fn iter(self) -> impl Iterator<Item = Channel> {
-        self.0.iter().copied()
+    /// All there are.
+    pub const fn all() -> Self {
+        Self { numbers: Vec::new() }
+    }
+
+    /// Whether the channel with this number, from 1, is among them.
+    pub fn has(&self, number: u8) -> bool {
+        self.numbers.is_empty() || self.numbers.contains(&number)
+    }
+
+    /// Those of one device, one by one.
+    pub fn iter(&self) -> impl Iterator<Item = Channel> + use<'_> {
+        Channel::ALL.into_iter().filter(|channel| self.has(channel.number()))
+    }
+
+    /// Refuses channels that so many boards do not have.
+    pub fn check(&self, boards: usize) -> anyhow::Result<()> {
+        let count = boards * CHANNELS;
+        match self.numbers.iter().find(|number| usize::from(**number) > count) {
+            None => Ok(()),
+            Some(number) if boards == 1 => {
+                Err(wrong(format!("a device has channels 1 and 2, and no channel {number}")))
+            }
+            Some(number) => {
+                Err(wrong(format!("{boards} devices have channels 1 to {count}, and no channel {number}")))
+            }
+        }
     }
 }
 
 /// See [`Channels`].
 pub fn channels(text: &str) -> Result<Channels, String> {
-    match text {
-        "1" => Ok(Channels(&[Channel::Can1])),
-        "2" => Ok(Channels(&[Channel::Can2])),
-        "both" => Ok(Channels(&Channel::ALL)),
-        _ => Err("a channel is 1, 2 or both".to_owned()),
+    if matches!(text, "both" | "all") {
+        return Ok(Channels::all());
     }
+    let numbers = text.split(',').map(channel_number).collect::<Option<Vec<_>>>();
+    numbers.map(|numbers| Channels { numbers }).ok_or_else(|| {
+        "channels are 1, 2, several as 1,3, or both; a second device has 3 and 4, and can0 in a trace is channel 1"
+            .to_owned()
+    })
+}
+
+/// As [`channels`], for one device.
+pub fn channels_of_one(text: &str) -> Result<Channels, String> {
+    let channels = channels(text)?;
+    channels.check(1).map_err(|error| error.to_string())?;
+    Ok(channels)
+}
+
+/// The number of a channel, from 1: as `1`, or as the interface that a trace calls it, `can0`.
+fn channel_number(text: &str) -> Option<u8> {
+    let number = match text.strip_prefix("can") {
+        Some(index) => index.parse::<u8>().ok()?.checked_add(1)?,
+        None => text.parse().ok()?,
+    };
+    (1..=MOST_CHANNELS).contains(&number).then_some(number)
+}
+
+/// One channel of a device, as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.
+pub fn channel(text: &str) -> Result<Channel, String> {
+    let found = channel_number(text)
+        .and_then(|number| Channel::ALL.into_iter().find(|channel| channel.number() == number));
+    found.ok_or_else(|| "a channel is 1 or 2; can0 is channel 1, can1 is channel 2".to_owned())
 }
 
 /// Whether the terminal shows more than ASCII, as far as its environment tells.
@@ -99,11 +163,19 @@ mod tests {
     }
 
     #[test]
-    fn channels_are_one_two_or_both() {
-        let numbers = |text| channels(text).map(|channels| channels.iter().map(Channel::number).collect());
+    fn channels_have_numbers_and_the_names_that_traces_give_them() {
+        let numbers =
+            |text| channels_of_one(text).map(|channels| channels.iter().map(Channel::number).collect());
         assert_eq!(numbers("2"), Ok(vec![2]));
         assert_eq!(numbers("both"), Ok(vec![1, 2]));
-        assert_eq!(numbers("3"), Err("a channel is 1, 2 or both".to_owned()));
+        assert_eq!(numbers("1,2"), Ok(vec![1, 2]));
+        assert_eq!(numbers("can1"), Ok(vec![2]));
+        assert_eq!(numbers("3"), Err("a device has channels 1 and 2, and no channel 3".to_owned()));
+        for text in ["", "0", "1,", "33", "vcan0", "can", "-1"] {
+            assert!(channels(text).unwrap_err().starts_with("channels are 1, 2"), "{text}");
+        }
+        assert_eq!((channel("1"), channel("can1")), (Ok(Channel::Can1), Ok(Channel::Can2)));
+        assert!(channel("3").is_err() && channel("can2").is_err());
     }
 
     #[test]
@@ -111,7 +183,11 @@ mod tests {
         for (text, bps) in [("500000", 500_000), ("500k", 500_000), ("83.333k", 83_333), ("1M", 1_000_000)] {
             assert_eq!(bitrate(text), Ok(bps), "{text}");
         }
-        for text in ["", "0", "fast", "-5", "1e3", "5G", "k", "1.2.3", "inf"] {
+        assert_eq!(
+            bitrate("500").unwrap_err(),
+            "500 bit/s is slower than any CAN bus; write 500k for 500 kbit/s"
+        );
+        for text in ["", "0", "fast", "-5", "1e3", "5G", "k", "1.2.3", "inf", "83.333"] {
             assert!(bitrate(text).is_err(), "{text}");
         }
     }

@@ -4,6 +4,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use cantap::Channel;
+use cantap::device::channel_number;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode};
@@ -11,6 +12,7 @@ use cantap_trace::filter::Filter;
 
 use crate::address::OpenDevice;
 use crate::args;
+use crate::channel_bitrate::ChannelBitrate;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
 
@@ -35,6 +37,9 @@ pub struct ChannelArgs {
     /// Leave time stamps out of the stream, to save bandwidth: times are only upper bounds.
     #[arg(long)]
     no_stamps: bool,
+    /// Which of several boards this is for, from 0.
+    #[arg(skip)]
+    board: usize,
 }
 
 #[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
@@ -78,9 +83,26 @@ struct Plan {
 }
 
 impl ChannelArgs {
+    /// Only listening, at these bit rates; where there are none, with what is saved on the device.
+    pub fn listening(bitrates: Vec<ChannelBitrate>) -> Self {
+        let mut args = Self::default();
+        args.timing.bitrates = bitrates;
+        args
+    }
+
+    /// What of it concerns one of several boards, counted from 0, whose channels have their own numbers there.
+    pub fn on_board(&self, board: usize) -> Self {
+        Self { timing: self.timing.on_board(board), board, ..self.clone() }
+    }
+
+    /// The number that users know a channel by.
+    const fn number(&self, channel: Channel) -> u8 {
+        channel_number(self.board, channel)
+    }
+
     /// Whether anything was asked for.
     pub fn is_given(&self) -> bool {
-        let Self { timing, mode, one_shot, recovery, no_data, no_stamps } = self;
+        let Self { timing, mode, one_shot, recovery, no_data, no_stamps, board: _ } = self;
         timing.is_given_or_wished()
             || mode.is_some()
             || recovery.is_some()
@@ -132,12 +154,12 @@ impl ChannelArgs {
             match (filters, saved) {
                 (Some(filters), _) if !filters.is_empty() => {
                     if let Some(remainder) = hw_filter::apply(device, *channel, filters)?.remainder {
-                        eprintln!("cantap: channel {}: {remainder}", channel.number());
+                        eprintln!("cantap: channel {}: {remainder}", self.number(*channel));
                     }
                 }
                 (Some(_), Some(saved)) if !saved.filters.is_empty() => {
                     device.set_filters(*channel, &saved.filters)?;
-                    let (number, count) = (channel.number(), saved.filters.len());
+                    let (number, count) = (self.number(*channel), saved.filters.len());
                     eprintln!("cantap: channel {number}: only what its {count} saved filters accept");
                 }
                 _ => {}
@@ -146,7 +168,7 @@ impl ChannelArgs {
         for Plan { channel, config, .. } in &plans {
             device
                 .open_channel(*channel, Some(*config))
-                .with_context(|| format!("channel {}", channel.number()))?;
+                .with_context(|| format!("channel {}", self.number(*channel)))?;
         }
         Ok(plans.into_iter().map(|plan| (plan.channel, plan.config)).collect())
     }
@@ -171,7 +193,7 @@ impl ChannelArgs {
         filters: &[Filter],
     ) -> anyhow::Result<()> {
         for Plan { channel, config, saved } in self.plan(device, channels, None)? {
-            let number = channel.number();
+            let number = self.number(channel);
             let kept = saved.filter(|_| filters.is_empty()).map(|saved| saved.filters).unwrap_or_default();
             let filters = match hw_filter::compile(filters, channel) {
                 Compiled { remainder: Some(remainder), .. } => bail!(
@@ -208,7 +230,7 @@ impl ChannelArgs {
                 (None, None) => bail!(
                     "no bit rate for channel {}: give one with -b RATE, find it with `cantap autobaud`, or save one \
                      with `cantap defaults save`",
-                    channel.number()
+                    self.number(channel)
                 ),
             },
         };
@@ -233,14 +255,5 @@ pub const fn mode_name(mode: Mode) -> &'static str {
         Mode::Normal => "normal",
         Mode::Loopback => "loopback",
         Mode::SilentLoopback => "silent-loopback",
-    }
-}
-
-/// A channel as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.
-pub fn channel(text: &str) -> Result<Channel, String> {
-    match text {
-        "1" | "can0" => Ok(Channel::Can1),
-        "2" | "can1" => Ok(Channel::Can2),
-        _ => Err("write can0 or 1 for channel 1, can1 or 2 for channel 2".to_owned()),
     }
 }

@@ -1,6 +1,6 @@
 //! The trace that a command reads: which file, and what to do about what is wrong in it.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use anyhow::bail;
 use cantap::TraceRecord;
@@ -75,8 +75,8 @@ impl ReadArgs {
     }
 
     /// Opens the device if one was given, else the file.
-    pub fn open_either(&self, path: Option<&Path>, live: &LiveArgs) -> anyhow::Result<Records> {
-        match (live.open()?, path) {
+    pub fn open_either(&self, path: Option<&PathBuf>, live: &LiveArgs) -> anyhow::Result<Records> {
+        match (live.open(path)?, path) {
             (Some(live), _) => Ok(self.records(Source::Device(live))),
             (None, Some(path)) => self.open(path),
             (None, None) => bail!("give a trace to read, or a device with -d"),

@@ -1,30 +1,36 @@
-//! The records of a device, for commands that read a trace or listen to a bus.
+//! The records of devices, for commands that read a trace or listen to buses.
 
 use std::fmt::Write;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::{Context, bail};
+use anyhow::anyhow;
 use cantap::TraceRecord;
-use cantap::device::{Happening, Reconnecting, Return};
+use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
+use cantap::wire::message::{ChannelConfig, Mode};
 
 use crate::address::{Address, OpenDevice};
-use crate::{advice, args, interrupt};
+use crate::boards::{Boards, filters_on, place_of};
+use crate::channel_args::ChannelArgs;
+use crate::channel_bitrate::ChannelBitrate;
+use crate::hearing::{self, Hearing};
+use crate::{advice, args, interrupt, stderr};
 
-/// Which device, and how; for commands to flatten into theirs, beside an input file that is
-/// `required_unless_present = "device"`.
+/// Which devices, and how; for commands to flatten into theirs, beside an input file.
 #[derive(clap::Args)]
 pub struct LiveArgs {
-    /// Listen to a device instead of reading a file, until Ctrl-C.
-    #[arg(short, long, conflicts_with = "input", requires = "bitrate")]
-    device: Option<Address>,
-    /// The device's channel to listen to: 1, 2 or both.
-    #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
+    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
+    #[arg(short, long, conflicts_with = "input")]
+    device: Vec<Address>,
+    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
+    #[arg(short, long, default_value = "both", value_parser = args::channels)]
     channel: args::Channels,
-    /// Bit rate of the bus in bit/s: 500000, 500k, 1M.
-    #[arg(short, long, requires = "device", value_parser = args::bitrate)]
-    bitrate: Option<u32>,
-    /// Stop listening after this time, as 10, 500ms or 2m.
-    #[arg(short, long, requires = "device", value_parser = args::positive_duration)]
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be
+    /// repeated. Without it, the one saved on the device.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    bitrates: Vec<ChannelBitrate>,
+    /// Listen only for so long, as 10, 500ms or 2m.
+    #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
 }
 
@@ -32,24 +38,35 @@ pub struct LiveArgs {
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// A device that the command goes on with when it is back; errors are told to the user.
-pub type Line = Reconnecting<'static, OpenDevice, anyhow::Error>;
+pub type Line = Reconnecting<OpenDevice, anyhow::Error>;
+/// Several of them.
+pub type Lines = Several<OpenDevice, anyhow::Error>;
 
-/// The device at an address, as soon as it is there; `setup` opens its channels.
-pub fn line(
-    address: &Address,
-    setup: impl FnMut(&OpenDevice) -> anyhow::Result<()> + Send + 'static,
-) -> Line {
-    let at = address.clone();
-    Line::new(&address.to_string(), move |serial| at.open_again(serial), setup)
+/// The devices, each as soon as it is there; `setup` opens the channels of the one with that number, from 0.
+pub fn lines<S>(addresses: &[Address], setup: S) -> Lines
+where
+    S: FnMut(usize, &OpenDevice) -> anyhow::Result<()> + Clone + Send + 'static,
+{
+    let line = |(board, address): (usize, &Address)| {
+        let (at, mut setup) = (address.clone(), setup.clone());
+        let connect = move |serial: Option<&str>| at.open_again(serial);
+        Line::new(&address.to_string(), connect, move |device| setup(board, device))
+    };
+    Several::new(addresses.iter().enumerate().map(line).collect())
 }
 
-/// What a device hears.
+/// What devices hear.
 pub struct LiveRecords {
-    line: Line,
-    may_come_back: bool,
+    lines: Lines,
+    addresses: Vec<Address>,
     ends: Option<Instant>,
-    /// How [`Line::stop`] went.
+    /// Devices that have been away for so long are not waited for.
+    give_up_after: Option<Duration>,
+    /// How stopping went.
     stopped: Option<anyhow::Result<()>>,
+    hearing: Hearing,
+    /// Frames may be there although none is heard, so that silence says nothing.
+    is_filtered: bool,
 }
 
 impl LiveArgs {
@@ -58,45 +75,107 @@ impl LiveArgs {
         self.device.iter()
     }
 
-    /// Opens the device and its channels, if one was given.
-    pub fn open(&self) -> anyhow::Result<Option<LiveRecords>> {
-        let Some(address) = &self.device else { return Ok(None) };
-        let Some(bitrate) = self.bitrate else { bail!("give the bus's bit rate with -b, such as -b 500k") };
-        let channels = self.channel;
-        let live = LiveRecords::open(address, self.time, move |device| {
-            for channel in channels.iter() {
-                device.listen(channel, bitrate).with_context(|| format!("channel {}", channel.number()))?;
-            }
-            Ok(())
-        })?;
-        Ok(Some(live))
+    /// Opens the devices and their channels: those that were given, or, without a file, the one that is connected.
+    pub fn open(&self, input: Option<&PathBuf>) -> anyhow::Result<Option<LiveRecords>> {
+        if input.is_some() {
+            return Ok(None);
+        }
+        let boards = Boards::new(&self.device, &self.channel)
+            .map_err(|error| error.context("without a trace to read, a device is listened to"))?;
+        LiveRecords::listen(&boards, &self.bitrates, self.time).map(Some)
     }
 }
 
 impl LiveRecords {
-    /// Opens a device, and its channels by `setup`, until Ctrl-C or the end of the time.
-    pub fn open(
-        address: &Address,
+    /// Only listens, at these bit rates and else at the saved ones, until Ctrl-C or the end of the time.
+    pub fn listen(
+        boards: &Boards,
+        bitrates: &[ChannelBitrate],
         time: Option<Duration>,
-        setup: impl FnMut(&OpenDevice) -> anyhow::Result<()> + Send + 'static,
     ) -> anyhow::Result<Self> {
+        let open = ChannelArgs::listening(bitrates.to_vec());
+        Self::open(boards, &open, &[], time)
+    }
+
+    /// Opens the boards' channels, which only listen unless `open` says otherwise, until Ctrl-C or the end of the time.
+    pub fn open(
+        boards: &Boards,
+        open: &ChannelArgs,
+        filters: &[cantap_trace::filter::Filter],
+        time: Option<Duration>,
+    ) -> anyhow::Result<Self> {
+        open.timing.check_channels(boards.addresses().len())?;
+        let (setup_boards, open, setup_filters) = (boards.clone(), open.clone(), filters.to_vec());
+        let mut lines = lines(boards.addresses(), move |board, device| {
+            let (open, filters) = (open.on_board(board), filters_on(board, &setup_filters));
+            open.open(device, setup_boards.channels_of(board), Mode::ListenOnly, Some(&filters)).map(|_| ())
+        });
+        // Until here, Ctrl-C ends the program: nothing has been captured.
+        lines.connect()?;
         interrupt::watch()?;
-        let mut line = line(address, setup);
-        line.connect()?;
-        let ends = time.map(|time| Instant::now() + time);
-        Ok(Self { line, may_come_back: address.may_come_back(), ends, stopped: None })
+        Ok(Self {
+            lines,
+            addresses: boards.addresses().to_vec(),
+            ends: time.map(|time| Instant::now() + time),
+            give_up_after: None,
+            stopped: None,
+            hearing: Hearing::default(),
+            is_filtered: !filters.is_empty(),
+        })
     }
 
-    /// The device, wherever it is.
-    pub const fn line(&self) -> &Line {
-        &self.line
+    /// Ends with an error when every device has been away for so long.
+    pub fn give_up_after(&mut self, time: Option<Duration>) {
+        self.give_up_after = time;
     }
 
-    /// Ends the capture: what is left comes from [`Self::next_batch`], and an error at its end if the device did not have its
+    /// The devices, wherever they are.
+    pub const fn lines(&self) -> &Lines {
+        &self.lines
+    }
+
+    /// The bit rates of the channels that are open, by number, in bit/s.
+    pub fn bit_rates(&self) -> Vec<(u8, u32)> {
+        let opened = self.opened();
+        opened.map(|(number, config, clock_hz)| (number, config.timing.bitrate_bps(clock_hz))).collect()
+    }
+
+    /// The channels that are open, by number, each with how it was opened and its controller's clock in Hz.
+    pub fn opened(&self) -> impl Iterator<Item = (u8, ChannelConfig, u32)> {
+        self.lines.devices().flat_map(|(board, device)| {
+            let clock_hz = device.hello().can_clock_hz;
+            let opened = device.open_channels().into_iter();
+            opened.map(move |(channel, config)| (channel_number(board, channel), config, clock_hz))
+        })
+    }
+
+    /// Their addresses.
+    pub fn addresses(&self) -> &[Address] {
+        &self.addresses
+    }
+
+    /// Whether it has been said of a channel that it hears errors only.
+    pub fn has_told_errors(&self, number: u8) -> bool {
+        self.hearing.is_told(number)
+    }
+
+    /// What it means that a channel hears errors only, and what to do.
+    pub fn errors_only(&self, number: u8) -> String {
+        let (board, channel) = place_of(number);
+        let device = self.addresses.get(board).map(ToString::to_string).unwrap_or_default();
+        hearing::meaning(number, &device, channel.number())
+    }
+
+    /// Ends the capture: what is left comes from [`Self::next_batch`], and an error at its end if a device did not have its
     /// last word.
     pub fn stop(&mut self) {
         if self.stopped.is_none() {
-            self.stopped = Some(self.line.stop());
+            let mut errors = self.lines.stop().into_iter();
+            let first = errors.next();
+            for error in errors {
+                eprintln!("cantap: {}", advice::sentence(&error));
+            }
+            self.stopped = Some(first.map_or(Ok(()), Err));
         }
     }
 
@@ -111,24 +190,49 @@ impl LiveRecords {
         interrupt::requested() || self.ends.is_some_and(|ends| Instant::now() >= ends)
     }
 
+    /// Whether all devices have been away for so long that they are given up.
+    fn has_given_up(&self) -> bool {
+        self.give_up_after.is_some_and(|patience| {
+            self.lines.lines().all(|line| line.away_for().is_some_and(|away| away >= patience))
+        })
+    }
+
     /// Puts the next records, or none after a while without any, in the place of what is in `records`; false after Ctrl-C
-    /// or the end of the time, when everything that was captured has been handed out. Says on standard error when the device
-    /// goes and when it is back.
+    /// or the end of the time, when everything that was captured has been handed out. Says on standard error when a device
+    /// goes, when it is back, and when a channel hears nothing but errors.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {
         if self.is_over() {
             self.stop();
+        } else if self.stopped.is_none() && self.has_given_up() {
+            let seconds = self.give_up_after.unwrap_or_default().as_secs_f64();
+            let _ = self.lines.stop();
+            self.stopped = Some(Err(anyhow!(
+                "the device has been away for {seconds} s and is not waited for any longer; what was captured before is there"
+            )));
         }
-        match self.line.next(LOOK_EVERY) {
+        let (board, happening) = self.lines.next(LOOK_EVERY);
+        match happening {
             Happening::Records(batch) => {
-                self.line.recycle(std::mem::replace(records, batch));
+                self.lines.recycle(std::mem::replace(records, batch));
+                self.listen_for_errors(records);
                 return Ok(true);
             }
-            Happening::Gone(error) if self.may_come_back => {
+            Happening::Gone(error) if self.addresses[board].may_come_back() => {
                 let reason = advice::sentence(&error);
-                eprintln!("cantap: {reason}; it goes on when the device is back, and Ctrl-C ends it");
+                let rest = match self.give_up_after {
+                    Some(time) => format!(
+                        "it goes on when the device is back within {} s, and Ctrl-C ends it",
+                        time.as_secs_f64()
+                    ),
+                    None => "it goes on when the device is back, and Ctrl-C ends it".to_owned(),
+                };
+                eprintln!("cantap: {reason}; {rest}");
             }
             Happening::Gone(error) => return Err(error),
-            Happening::Back(back) => eprintln!("cantap: {}", welcome(&back)),
+            Happening::Back(back) => {
+                let name = (self.addresses.len() > 1).then(|| &self.addresses[board]);
+                eprintln!("cantap: {}", welcome(board, name, &back));
+            }
             Happening::Ended => {
                 records.clear();
                 return self.stopped.take().unwrap_or(Ok(())).map(|()| false);
@@ -137,17 +241,29 @@ impl LiveRecords {
         records.clear();
         Ok(true)
     }
+
+    fn listen_for_errors(&mut self, records: &[TraceRecord]) {
+        if self.is_filtered {
+            return;
+        }
+        let now = Instant::now();
+        self.hearing.take(records, now);
+        for number in self.hearing.news(now) {
+            stderr::warn(&self.errors_only(number));
+        }
+    }
 }
 
-/// What there is to say of a device that is there again.
-fn welcome(back: &Return) -> String {
+/// What there is to say of a device that is there again, with its name if there are several.
+fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
     let after = back.after.unwrap_or_default().as_secs_f64();
+    let at = name.map_or_else(String::new, |name| format!(" at '{name}'"));
     let mut said = match &back.other_board {
-        Some(name) => format!("another board is there now, {name}, after {after:.1} s"),
-        None => format!("the device is back after {after:.1} s"),
+        Some(other) => format!("another board is there now{at}, {other}, after {after:.1} s"),
+        None => format!("the device{at} is back after {after:.1} s"),
     };
     for channel in &back.only_listening {
-        let _ = write!(said, "; channel {} only listens on it", channel.number());
+        let _ = write!(said, "; channel {} only listens on it", channel_number(board, *channel));
     }
     said
 }

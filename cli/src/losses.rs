@@ -28,6 +28,16 @@ impl Losses {
         losses
     }
 
+    /// Those of two devices together.
+    pub const fn plus(self, other: Self) -> Self {
+        Self {
+            controller: self.controller + other.controller,
+            queue: self.queue + other.queue,
+            link: self.link + other.link,
+            host: self.host + other.host,
+        }
+    }
+
     /// One line.
     pub fn line(&self) -> String {
         let Self { controller, queue, link, host } = self;

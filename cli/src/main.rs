@@ -6,7 +6,9 @@
 macro_rules! eprintln {
     ($($part:tt)*) => {{
         use std::io::Write as _;
-        let _ = writeln!(std::io::stderr(), $($part)*);
+        $crate::progress::aside(|| {
+            let _ = writeln!(std::io::stderr(), $($part)*);
+        });
     }};
 }
 
@@ -22,19 +24,23 @@ mod address;
 mod advice;
 mod args;
 mod beside;
+mod boards;
 mod channel_args;
 mod channel_bitrate;
 mod clock;
 mod commands;
 mod databases;
+mod hearing;
 mod input;
 mod interrupt;
 mod live;
 mod losses;
 mod meter;
 mod monitor;
+mod progress;
 mod rescue;
 mod sending;
+mod stderr;
 mod timing_args;
 mod trigger_args;
 mod words;
@@ -97,7 +103,9 @@ fn leave(error: &clap::Error) -> ! {
 
 /// What belongs to the command line and is understood only later, as a condition is when the databases have been read.
 fn is_wrong_command_line(error: &anyhow::Error) -> bool {
-    error.is::<wrong::WrongCommandLine>() || error.is::<cantap_signals::condition::ConditionError>()
+    error.is::<wrong::WrongCommandLine>()
+        || error.is::<cantap_signals::condition::ConditionError>()
+        || error.chain().any(advice::is_unknown_format)
 }
 
 /// Whether it only says that nobody reads our output any more.

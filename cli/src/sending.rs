@@ -226,6 +226,16 @@ impl Outcome {
         })
     }
 
+    /// The counts, for scripts.
+    pub fn object(&self) -> serde_json::Value {
+        serde_json::json!({
+            "asked": self.asked,
+            "not_sent": self.not_sent,
+            "overtaken": self.overtaken,
+            "reason": self.reason(),
+        })
+    }
+
     /// An error with the reason if anything went wrong.
     pub fn verdict(&self) -> anyhow::Result<()> {
         match self.reason() {

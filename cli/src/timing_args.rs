@@ -2,9 +2,10 @@
 
 use cantap::Channel;
 use cantap::bit_timing::{self, TimingError, TimingRequest};
-use cantap::wire::BitTiming;
+use cantap::wire::{BitTiming, CHANNELS};
 
 use crate::advice;
+use crate::boards::place_of;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::wrong::wrong;
 
@@ -65,21 +66,38 @@ impl TimingArgs {
         self.bitrates = rates;
     }
 
-    /// Refuses bit rates of channels that no device has.
-    pub fn check_channels(&self) -> anyhow::Result<()> {
-        let is_there = |number| Channel::ALL.iter().any(|channel| channel.number() == number);
-        let named = self.bitrates.iter().filter_map(|rate| rate.channel).find(|number| !is_there(*number));
-        named.map_or(Ok(()), |number| {
-            Err(wrong(format!(
-                "a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k"
-            )))
-        })
+    /// Refuses bit rates of channels that so many boards do not have.
+    pub fn check_channels(&self, boards: usize) -> anyhow::Result<()> {
+        let count = boards * CHANNELS;
+        let named = self.bitrates.iter().filter_map(|rate| rate.channel);
+        let Some(number) = named.into_iter().find(|number| usize::from(*number) > count) else {
+            return Ok(());
+        };
+        Err(wrong(if boards == 1 {
+            format!("a device has no channel {number}; give a bit rate for channel 1 or 2, as -b 2:250k")
+        } else {
+            format!(
+                "{boards} devices have no channel {number}; give a bit rate for channels 1 to {count}, as -b 2:250k"
+            )
+        }))
+    }
+
+    /// What of it concerns one of several boards, counted from 0, whose channels have their own numbers there.
+    pub fn on_board(&self, board: usize) -> Self {
+        let own = |rate: &ChannelBitrate| match rate.channel.map(place_of) {
+            None => Some(*rate),
+            Some((place, channel)) if place == board => {
+                Some(ChannelBitrate { channel: Some(channel.number()), ..*rate })
+            }
+            Some(_) => None,
+        };
+        Self { bitrates: self.bitrates.iter().filter_map(own).collect(), ..self.clone() }
     }
 
     /// What was asked for on a channel, if anything was.
     pub fn request(&self, channel: Channel) -> anyhow::Result<Option<TimingRequest>> {
         self.wishes.check()?;
-        self.check_channels()?;
+        self.check_channels(1)?;
         if let Some(timing) = self.segments.or(self.btr) {
             return Ok(Some(TimingRequest::Exact(timing)));
         }

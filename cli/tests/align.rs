@@ -47,7 +47,7 @@ fn two_recorders_of_a_bus_become_one_trace() {
     assert_eq!(found["frames_in_both"], 15_000);
     assert_eq!((&found["only_in_first"], &found["only_in_this"]), (&0.into(), &0.into()));
     assert!((found["drift_ppm"].as_f64().unwrap() - 40.0).abs() < 0.2, "{found}");
-    assert!((found["offset_seconds"].as_f64().unwrap() - 3.25).abs() < 0.001, "{found}");
+    assert!((found["offset_s"].as_f64().unwrap() - 3.25).abs() < 0.001, "{found}");
     let both = std::fs::read_to_string(folder.join("both.log")).unwrap();
     assert_eq!(both.lines().count(), 40_000);
     assert_eq!(both.lines().filter(|line| line.contains(" can1 ")).count(), 20_000);

@@ -127,8 +127,9 @@ fn one_screen_can_be_printed_without_a_terminal() {
 }
 
 #[test]
-fn without_anything_the_virtual_device_is_shown() {
-    let text = stdout(cantap().args(["monitor", "--once", "-t", "600ms", "--view", "trace"]));
+fn one_screen_is_printed_and_a_device_that_is_not_there_is_told() {
+    let text =
+        stdout(cantap().args(["monitor", "-d", "virtual", "--once", "-t", "600ms", "--view", "trace"]));
     assert!(text.contains(" virtual listen-only: running"), "{text}");
     let reason = failure(cantap().args(["monitor", "-d", "/dev/nowhere", "--once"]));
     // Without a bit rate too: the board may have one saved.

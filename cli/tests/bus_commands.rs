@@ -276,7 +276,8 @@ fn after_a_time_the_command_brings_the_channel_back() {
 fn errors_are_captured_by_kind_and_a_broken_bus_does_not_flood_the_link() {
     let capture = |bus: &str| {
         let (code, out, err) = cantap(&format!("capture -d virtual:{bus},frames=std8 -c 1 -b 500k -t 500ms"));
-        assert_eq!(code, Some(0), "{bus}: {err}");
+        // A capture of nothing but errors is none.
+        assert_eq!(code, Some(i32::from(err.contains("channel 1: 0 frames"))), "{bus}: {err}");
         let details = |class: &str| -> Vec<String> {
             let lines =
                 out.lines().filter_map(|line| line.split_once(class).map(|(_, data)| data.to_owned()));
@@ -336,7 +337,7 @@ fn a_replay_takes_canplayers_options() {
     for (options, part) in [
         ("-l 0", "from 1, or i"),
         ("-n 0", "0"),
-        ("stdout=can0", "can0 or 1"),
+        ("stdout=can0", "a channel is 1 or 2"),
         // Without times there is nothing to hold apart, and canplayer sends a frame once.
         ("-t -g 50", "--gap"),
         ("-t --speed 2", "--speed"),

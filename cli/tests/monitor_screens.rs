@@ -49,7 +49,7 @@ fn one_screen_is_text_of_the_size_that_was_asked_for() {
         ("monitor --normal --mode listen --once", 2, "--mode"),
         ("monitor a.log -d virtual", 2, "--device"),
         ("monitor -d virtual -b 999999 --once", 1, "947368"),
-        ("monitor -d virtual -c 3 --once", 2, "a channel is 1, 2 or both"),
+        ("monitor -d virtual -c 3 --once", 2, "a device has channels 1 and 2, and no channel 3"),
         ("monitor -d virtual -b 3:250k --once", 2, "a device has no channel 3"),
         ("monitor -d virtual:load=101 --once", 2, "give per cent, 0 to 100"),
         ("monitor -d emu:any.elf,load=101 --once", 2, "give per cent, 0 to 100"),

@@ -132,7 +132,7 @@ fn the_emulated_board_is_watched_sent_with_and_recorded() {
     view.wait_for("Channel 2: 500000 bit/s");
     view.wait_for("Device olimex-p405");
     // Into the bus, and onto it.
-    view.keys("m");
+    view.keys("my\r");
     view.wait_for("normal: running");
     view.keys("6a6F7#DEADBEEF\r\r1f6F7:7FF\r");
     view.wait_for("T      6F7 D 4 DE AD BE EF");

@@ -148,7 +148,7 @@ fn differences_are_listed() {
         cantap("diff", &["diff", "a.log", "b.log", "--json", "--check", "--tolerance", "60"]);
     assert_eq!(code, Some(3));
     let found: serde_json::Value = serde_json::from_str(&out).unwrap();
-    let key = |id: &str| serde_json::json!({ "ch": 1, "id": id, "remote": false, "fd": false });
+    let key = |id: &str| serde_json::json!({ "channel": 1, "id": id, "remote": false, "fd": false });
     let with = |mut value: serde_json::Value, more: serde_json::Value| {
         value.as_object_mut().unwrap().extend(more.as_object().unwrap().clone());
         value

@@ -41,7 +41,7 @@ fn json_has_every_timing_and_the_chosen_one() {
     let chosen: Vec<_> = timings.iter().filter(|timing| timing["chosen"] == true).collect();
     assert_eq!(chosen, [&object["chosen"]]);
     assert!((chosen[0]["error_ppm"].as_f64().unwrap() - 4.0).abs() < 0.01, "{chosen:?}");
-    assert_eq!(chosen[0]["sample_point_percent"], 87.5);
+    assert_eq!(chosen[0]["sample_point_pct"], 87.5);
 }
 
 #[test]

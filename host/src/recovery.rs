@@ -13,18 +13,31 @@ use crate::{Device, DeviceError};
 /// How often the device is asked.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
+/// A channel that was told to come back is there after 128 times 11 recessive bits, 0.3 s at 5 kbit/s on a quiet bus. One that is
+/// bus-off still, or again, after so long is told once more.
+const COMES_WITHIN: Duration = Duration::from_secs(1);
+
+/// A channel that is bus-off.
+#[derive(Clone, Copy, Debug)]
+enum Off {
+    /// Left alone, since then.
+    Since(Instant),
+    /// Told to come back, then.
+    Told(Instant),
+}
+
 /// Looks after channels that are open with manual recovery.
 #[derive(Clone, Debug)]
 pub struct Recovery {
     after: Duration,
-    off_since: [Option<Instant>; CHANNELS],
+    off: [Option<Off>; CHANNELS],
     look_at: Instant,
 }
 
 impl Recovery {
     /// Channels come back so long after they went bus-off.
     pub fn new(after: Duration) -> Self {
-        Self { after, off_since: [None; CHANNELS], look_at: Instant::now() }
+        Self { after, off: [None; CHANNELS], look_at: Instant::now() }
     }
 
     /// Looks the next time, however soon that is: there is a sign that a channel went off.
@@ -32,13 +45,13 @@ impl Recovery {
         self.look_at = Instant::now();
     }
 
-    /// Whether a channel is bus-off and has still to wait.
+    /// Whether a channel is bus-off and will be brought back; what is sent on it meanwhile fails.
     pub fn is_waiting(&self) -> bool {
-        self.off_since.iter().any(Option::is_some)
+        self.off.iter().any(Option::is_some)
     }
 
     /// To be called again and again: asks the device now and then, and recovers what has been off for long enough.
-    /// Returns the channels that it recovered.
+    /// Returns the channels that are back.
     pub fn look(&mut self, device: &Device) -> Result<Vec<Channel>, DeviceError> {
         let now = Instant::now();
         let mut recovered = Vec::new();
@@ -49,16 +62,24 @@ impl Recovery {
         let status = device.status()?;
         for channel in Channel::ALL {
             let state = &status.channels[channel.index()];
-            let since = &mut self.off_since[channel.index()];
+            let off = &mut self.off[channel.index()];
             let is_off =
                 state.state == ErrorState::BusOff && state.open.is_some_and(|config| config.manual_recovery);
             if !is_off {
-                *since = None;
-            } else if now.duration_since(*since.get_or_insert(now)) >= self.after {
-                *since = None;
+                if let Some(Off::Told(_)) = off.take() {
+                    recovered.push(channel);
+                }
+                continue;
+            }
+            let is_time = match *off.get_or_insert(Off::Since(now)) {
+                Off::Since(since) => now.duration_since(since) >= self.after,
+                Off::Told(told) => now.duration_since(told) >= self.after.max(COMES_WITHIN),
+            };
+            if is_time {
+                *off = Some(Off::Told(now));
                 match device.recover(channel) {
-                    Ok(()) => recovered.push(channel),
-                    Err(DeviceError::Refused { refusal: Refusal::NotBusOff | Refusal::ChannelClosed }) => {}
+                    Ok(())
+                    | Err(DeviceError::Refused { refusal: Refusal::NotBusOff | Refusal::ChannelClosed }) => {}
                     Err(error) => return Err(error),
                 }
             }

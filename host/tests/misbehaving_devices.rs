@@ -21,7 +21,7 @@ const PATIENCE: Duration = Duration::from_mins(1);
 const BEFORE: u32 = 60;
 const WAIT: Duration = Duration::from_millis(50);
 
-type Line = Reconnecting<'static, Device, DeviceError>;
+type Line = Reconnecting<Device, DeviceError>;
 
 fn start(fault: Fault, serial: &str, log: &Arc<Mutex<Log>>) -> (Device, JoinHandle<()>) {
     let (link, fake) = FakeDevice::new();

@@ -297,3 +297,23 @@ fn the_order_on_the_bus_is_the_order_of_confirmation() {
     assert_eq!(rig.ledger.delivered_count(Can2), 4);
     settle(&mut rig);
 }
+
+/// RM0090 Rev 21 §32.4.1 and §32.7.6: initialisation mode changes no counter; the controller's reset and the end of bus-off do. The
+/// virtual device does the same (`host/virtual/tests/virtual_device.rs`).
+#[test]
+fn error_counters_outlive_closing_and_opening() {
+    let mut rig = connected(common::setup());
+    rig.ask(Command::Open { channel: Can1, config: Some(normal()) }).unwrap();
+    // Nobody else is there to acknowledge.
+    send(&mut rig, Can1, 1, &["100#01"]);
+    rig.run_for(20 * MS).unwrap();
+    assert_eq!(rig.status().unwrap().channels[0].tec, 128);
+    rig.ask(Command::Abort { channel: Can1 }).unwrap();
+    rig.ask(Command::Close { channel: Can1 }).unwrap();
+    rig.run_for(2 * MS).unwrap();
+    let listening = ChannelConfig { mode: Mode::ListenOnly, ..normal() };
+    rig.ask(Command::Open { channel: Can1, config: Some(listening) }).unwrap();
+    rig.run_for(2 * MS).unwrap();
+    let state = rig.status().unwrap().channels[0];
+    assert_eq!((state.tec, state.state), (128, ErrorState::Passive));
+}

@@ -285,7 +285,7 @@ fn to_json(args: &Args, found: &[Found], left_out: Option<&LeftOut>) -> Value {
             "channels": alignment.channels.iter().map(|&(first, own)| json!({
                 "first": first, "own": own, "written": u16::from(own) + u16::from(*channel_offset),
             })).collect::<Vec<_>>(),
-            "offset_seconds": -(alignment.map.ahead_ns() as f64) / 1e9,
+            "offset_s": -(alignment.map.ahead_ns() as f64) / 1e9,
             "drift_ppm": -alignment.map.drift_ppm(),
             "clock_set": alignment.map.steps(),
             "moments": alignment.moments,

@@ -8,8 +8,8 @@ use anyhow::bail;
 use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
-use crate::address::Address;
-use crate::{args, channel_args, interrupt};
+use crate::boards::OneBoard;
+use crate::{args, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -18,11 +18,10 @@ use crate::{args, channel_args, interrupt};
                         cantap autobaud -d virtual:bitrate=125k -c 2 --json"
 )]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// Which channel: 1 or 2.
-    #[arg(short, long, default_value = "1", value_parser = channel_args::channel)]
+    #[arg(short, long, default_value = "1", value_parser = args::channel)]
     channel: Channel,
     /// Give up after this time without any sign of traffic, but not before each common rate was tried once.
     #[arg(short, long, default_value = "10s", value_name = "TIME", value_parser = args::duration)]
@@ -58,7 +57,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                     "channel": args.channel.number(),
                     "bitrate_bps": bitrate_bps,
                     "frames": frames,
-                    "sample_point_percent": f64::from(timing.sample_point_permille()) / 10.0,
+                    "sample_point_pct": f64::from(timing.sample_point_permille()) / 10.0,
                     "segments": [u16::from(timing.segment1), u16::from(timing.segment2)],
                     "prescaler": timing.prescaler,
                     "sjw": timing.jump_width,

@@ -3,14 +3,13 @@
 use std::io::Write;
 use std::process::ExitCode;
 
-use crate::address::Address;
+use crate::boards::OneBoard;
 
 /// The command line of `cantap identify`.
 #[derive(clap::Args)]
 pub struct Identify {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// How long to show the pattern, in seconds.
     #[arg(short, long, default_value_t = 5, value_parser = clap::value_parser!(u8).range(1..))]
     seconds: u8,
@@ -19,9 +18,8 @@ pub struct Identify {
 /// The command line of `cantap reset`.
 #[derive(clap::Args)]
 pub struct Reset {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
 }
 
 /// Runs `cantap identify`.

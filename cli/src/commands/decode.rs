@@ -39,7 +39,7 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     /// The trace; - for standard input.
-    #[arg(value_name = "IN", required_unless_present = "device")]
+    #[arg(value_name = "IN")]
     input: Option<PathBuf>,
     #[command(flatten)]
     live: LiveArgs,
@@ -98,7 +98,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<Count> {
-    let mut records = args.read.open_either(args.input.as_deref(), &args.live)?;
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut count = Count::default();
     let mut values = Vec::new();
     let step_ns = args.resample.map(|step| i64::try_from(step.as_nanos()).unwrap_or(i64::MAX));

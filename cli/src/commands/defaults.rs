@@ -8,8 +8,8 @@ use cantap::wire::message::{Defaults, FrameKind};
 use cantap_trace::filter::Filter;
 use serde_json::{Value, json};
 
-use crate::address::Address;
 use crate::args;
+use crate::boards::OneBoard;
 use crate::channel_args::{ChannelArgs, mode_name};
 
 /// The command line.
@@ -37,11 +37,10 @@ enum Action {
 
 #[derive(clap::Args)]
 struct Save {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// Which channels: 1, 2 or both. The other one keeps what is stored for it.
-    #[arg(short, long, default_value = "both", value_parser = args::channels)]
+    #[arg(short, long, default_value = "both", value_parser = args::channels_of_one)]
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,
@@ -52,9 +51,8 @@ struct Save {
 
 #[derive(clap::Args)]
 struct Show {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -62,9 +60,8 @@ struct Show {
 
 #[derive(clap::Args)]
 struct Clear {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
 }
 
 /// Runs it.
@@ -151,7 +148,7 @@ fn object(channel: Channel, defaults: Option<&Defaults>, clock_hz: u32) -> Value
         let timing = &defaults.config.timing;
         json!({
             "bitrate_bps": timing.bitrate_bps(clock_hz),
-            "sample_point_percent": f64::from(timing.sample_point_permille()) / 10.0,
+            "sample_point_pct": f64::from(timing.sample_point_permille()) / 10.0,
             "segments": [u16::from(timing.segment1), u16::from(timing.segment2)],
             "prescaler": timing.prescaler,
             "sjw": timing.jump_width,

@@ -136,8 +136,7 @@ fn list(dlcs: &[u8]) -> String {
 }
 
 fn to_json(difference: &Difference) -> Value {
-    let kind =
-        |key: Key| json!({ "ch": key.channel, "id": key.id.to_string(), "remote": key.remote, "fd": key.fd });
+    let kind = |key: Key| json!({ "channel": key.channel, "id": key.id.to_string(), "remote": key.remote, "fd": key.fd });
     let only = |only: &[(Key, u64)]| {
         let entries = only.iter().map(|(key, count)| {
             let mut entry = kind(*key);

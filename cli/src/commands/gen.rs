@@ -10,8 +10,9 @@ use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
 use cantap::{Channel, Frame, Id, bits_on_bus};
 
-use crate::address::Address;
-use crate::channel_args::{self, ChannelArgs};
+use crate::args;
+use crate::boards::OneBoard;
+use crate::channel_args::ChannelArgs;
 use crate::interrupt;
 use crate::sending::Sending;
 use crate::wrong::wrong;
@@ -26,9 +27,8 @@ use crate::wrong::wrong;
                         cantap gen -d /dev/ttyACM0 -b 1M can0 -g 0 -m\n  cantap gen -d /dev/ttyACM0 -b 1M both --saturate\n  cantap gen -d virtual can1 -g 100 -c 8 -n 80"
 )]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// can0 or 1, can1 or 2; or both.
     #[arg(value_parser = channels)]
     channel: Channels,
@@ -98,7 +98,7 @@ fn channels(text: &str) -> Result<Channels, String> {
     if text == "both" {
         return Ok(Channel::ALL.into_iter().collect());
     }
-    let channel = channel_args::channel(text).map_err(|error| format!("{error}, or both"))?;
+    let channel = args::channel(text).map_err(|error| format!("{error}, or both"))?;
     Ok([channel].into_iter().collect())
 }
 

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 
 use cantap::wire::message::capability;
 
-use crate::address::Address;
+use crate::boards::OneBoard;
 
 use crate::clock;
 
@@ -13,9 +13,8 @@ use crate::clock;
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  cantap info -d /dev/ttyACM0\n  cantap info -d virtual --json")]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,

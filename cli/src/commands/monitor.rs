@@ -13,6 +13,7 @@ use cantap_trace::filter::Filter;
 
 use crate::address::Address;
 use crate::args;
+use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::{self, DatabaseArgs};
@@ -31,15 +32,16 @@ use crate::wrong::wrong;
     cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
     cantap monitor trace.blf -b 500k --db car.dbc\n  \
     cantap monitor -p car.toml\n\n\
-h shows the keys. Without a device and a file, the virtual device is shown, at 500 kbit/s without -b.")]
+h shows the keys. Without a device and a file, the board that is connected is listened to. Without a bit rate, given or\n\
+saved on the device, it is looked for by listening.")]
 pub struct Args {
     /// A trace to play back instead of a device.
-    #[arg(value_name = "FILE", conflicts_with = "device")]
+    #[arg(value_name = "FILE", conflicts_with = "devices")]
     file: Option<PathBuf>,
-    /// The device.
-    #[arg(short, long)]
-    device: Option<Address>,
-    /// Which channels: 1, 2 or both. Without it, those whose bit rate is given; both if none is.
+    /// The device. Repeat for several, whose channels are numbered on: the second one's are 3 and 4.
+    #[arg(short, long = "device", value_name = "DEVICE")]
+    devices: Vec<Address>,
+    /// Which channels: 1, 2, several as 1,3, or both, which is all. Without it, those whose bit rate is given; all if none is.
     #[arg(short, long, value_parser = args::channels, conflicts_with = "file")]
     channel: Option<args::Channels>,
     #[command(flatten)]
@@ -105,9 +107,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let profile = load_profile(args.profile.as_deref(), &mut complaints);
     let decoder = load_databases(args, &profile, &mut complaints);
     let open = channel_args(args, &profile, &mut complaints);
-    if args.file.is_none() {
-        open.timing.check_channels()?;
-    }
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
     let filters = filters(args, &profile, &mut complaints);
@@ -118,7 +117,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (origin, plan) = if let Some(path) = &args.file {
         (Origin::File(path.clone()), None)
     } else {
-        let plan = plan(args, &profile, open, &mut complaints);
+        let plan = plan(args, &profile, open, &mut complaints)?;
         (Origin::Device(plan.clone()), Some(plan))
     };
     let theme = Theme::from_environment(args.light || profile.light);
@@ -158,7 +157,7 @@ fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {
 
 fn load_databases(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Decoder {
     let own = if args.databases.is_empty() { profile.databases.as_slice() } else { &[] };
-    let databases = if own.is_empty() { args.databases.or_of(&args.device) } else { args.databases.clone() };
+    let databases = if own.is_empty() { args.databases.or_of(&args.devices) } else { args.databases.clone() };
     if databases.is_of_car() {
         complaints.push(databases::CAR.to_owned());
     }
@@ -193,21 +192,31 @@ fn filters(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<
     filters
 }
 
-fn plan(args: &Args, profile: &Profile, open: ChannelArgs, complaints: &mut Vec<String>) -> Plan {
-    let address = match (&args.device, &profile.device) {
-        (Some(address), _) => address.clone(),
-        (None, Some(text)) => text.parse().unwrap_or_else(|error| {
-            complaints.push(format!("device {text}: {error}"));
-            Address::of_virtual_device()
-        }),
-        (None, None) => Address::of_virtual_device(),
-    };
-    let mut plan = Plan { address, channels: Vec::new(), open };
+fn plan(
+    args: &Args,
+    profile: &Profile,
+    open: ChannelArgs,
+    complaints: &mut Vec<String>,
+) -> anyhow::Result<Plan> {
+    let mut addresses = args.devices.clone();
+    for text in profile.device.iter().chain(&profile.devices).filter(|_| args.devices.is_empty()) {
+        match text.parse() {
+            Ok(address) => addresses.push(address),
+            Err(error) => complaints.push(format!("device {text}: {error}")),
+        }
+    }
+    if addresses.is_empty() && !complaints.is_empty() {
+        addresses.push(Address::of_virtual_device());
+    }
+    let all = args::Channels::all();
+    let boards = Boards::new(&addresses, args.channel.as_ref().unwrap_or(&all))?;
+    open.timing.check_channels(boards.addresses().len())?;
+    let mut plan = Plan { addresses: boards.addresses().to_vec(), channels: Vec::new(), open };
     match args.channel {
-        Some(channels) => plan.channels = channels.iter().collect(),
+        Some(_) => plan.channels = boards.channel_numbers().collect(),
         None => plan.choose_channels(),
     }
-    plan
+    Ok(plan)
 }
 
 fn send_list(profile: &Profile, model: &Model, complaints: &mut Vec<String>) -> Vec<SendEntry> {

@@ -11,8 +11,8 @@ use cantap::wire::CHANNELS;
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, TraceEvent, TraceFrame};
 
-use crate::address::Address;
-use crate::channel_args::{self, ChannelArgs};
+use crate::boards::OneBoard;
+use crate::channel_args::ChannelArgs;
 use crate::input::ReadArgs;
 use crate::sending::Sending;
 use crate::wrong::wrong;
@@ -28,9 +28,8 @@ use crate::{args, interrupt};
                   cantap replay -d virtual -b 1M drive.blf --speed 2 -l 3 can0=can1"
 )]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// The trace; - for standard input.
     #[arg(value_name = "FILE", required_unless_present = "from")]
     input: Option<PathBuf>,
@@ -111,7 +110,7 @@ fn mapping(text: &str) -> Result<(Channel, u8), String> {
         || from.parse::<u8>().ok(),
         |interface| interface.parse::<u8>().ok().and_then(|interface| interface.checked_add(1)),
     );
-    Ok((channel_args::channel(to)?, from.filter(|from| *from > 0).ok_or_else(wrong)?))
+    Ok((args::channel(to)?, from.filter(|from| *from > 0).ok_or_else(wrong)?))
 }
 
 /// The device's channels. One that nothing is sent on is never opened: it would acknowledge on a bus that is none of the

@@ -34,7 +34,7 @@ use crate::words::{error_name, failure_name, state_name};
     Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
 pub struct Args {
     /// The trace; - for standard input.
-    #[arg(value_name = "FILE", required_unless_present = "device")]
+    #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
     /// What must hold, such as "Speed > 80 and Gear == 3".
     #[arg(value_name = "CONDITION", conflicts_with = "condition")]
@@ -107,7 +107,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
-    let mut records = args.read.open_either(args.input.as_deref(), &args.live)?;
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
     let (mut found, mut still_after) = (0, 0);
     // Whether something lies between the last record shown and the next.

@@ -15,6 +15,7 @@ use cantap::{Channel, Device};
 
 use self::report::{Outcome, Report};
 use crate::address::{Address, OpenDevice};
+use crate::boards::OneBoard;
 use crate::{args, exit, interrupt};
 
 /// The command line.
@@ -28,9 +29,8 @@ use crate::{args, exit, interrupt};
                         cantap selftest -d virtual:wire=joined,load=0 --loop --json"
 )]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
+    #[command(flatten)]
+    device: OneBoard,
     /// Channel 1 is wired to channel 2, and to nothing else: both take part in the bus and send.
     #[arg(long = "loop")]
     looped: bool,
@@ -54,11 +54,12 @@ const BITRATES_BPS: [u32; 4] = [1_000_000, 500_000, 250_000, 125_000];
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
-    let device = args.device.open()?;
-    let mut report = Report::new(&args.device, &device, !args.json);
-    test(args, &device, &mut report);
+    let address = args.device.address()?;
+    let device = address.open()?;
+    let mut report = Report::new(&address, &device, !args.json);
+    test(args, &address, &device, &mut report);
     let serial = device.hello().serial.as_str().to_owned();
-    restart(args, device, &serial, &mut report);
+    restart(args, &address, device, &serial, &mut report);
     report.finish();
     if let Some(path) = &args.report {
         std::fs::write(path, report.text()?)
@@ -71,11 +72,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Every step but the restart.
-fn test(args: &Args, device: &Device, report: &mut Report) {
+fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
     // What is wrong with it shows when it is read again.
     let saved = steps::saved(device).unwrap_or_default();
     report.step("identity", || Ok(steps::identity(device.hello())));
-    report.step("USB", || steps::usb(&args.device, device.hello()));
+    report.step("USB", || steps::usb(address, device.hello()));
     report.step("round trips", || steps::round_trips(device));
     for channel in Channel::ALL {
         report.step(&format!("channel {} listens", channel.number()), || buses::listen(device, channel));
@@ -114,10 +115,10 @@ fn test(args: &Args, device: &Device, report: &mut Report) {
     });
 }
 
-fn restart(args: &Args, device: OpenDevice, serial: &str, report: &mut Report) {
-    report.step("restart", move || match (args.restart, args.device.may_come_back()) {
+fn restart(args: &Args, address: &Address, device: OpenDevice, serial: &str, report: &mut Report) {
+    report.step("restart", move || match (args.restart, address.may_come_back()) {
         (false, _) => Ok(Outcome::Skip("it was not asked for (--restart)".to_owned())),
-        (true, true) => steps::restart(&args.device, device, serial),
+        (true, true) => steps::restart(address, device, serial),
         (true, false) => {
             Ok(Outcome::Skip("this device lives in this process, and would end with it".to_owned()))
         }
@@ -145,7 +146,8 @@ mod tests {
         let connection = start(options.parse::<Options>().unwrap()).unwrap();
         let witness = std::sync::Arc::clone(&connection.witness);
         let device = Device::over(connection.into_link(), "virtual").unwrap();
-        test(&args, &device, &mut Report::new(&args.device, &device, false));
+        let address = args.device.address().unwrap();
+        test(&args, &address, &device, &mut Report::new(&address, &device, false));
         witness.heard().driven
     }
 

@@ -2,6 +2,7 @@
 
 mod modifiers;
 
+use std::io::Write;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -15,9 +16,10 @@ use cantap::{Channel, Device, Frame, Id, hw_filter};
 use cantap_trace::filter::Filter;
 use modifiers::Modifiers;
 
-use crate::address::Address;
-use crate::channel_args::{self, ChannelArgs};
+use crate::boards::OneBoard;
+use crate::channel_args::ChannelArgs;
 use crate::databases::DatabaseArgs;
+use crate::meter::rounded;
 use crate::sending::{LOOK_EVERY, Sending};
 use crate::wrong::wrong;
 use crate::{args, interrupt};
@@ -31,11 +33,10 @@ use crate::{args, interrupt};
                   cantap send -d COM5 -b 250k can0 7E8#0341 --on-rx 7E0:7FF\n  \
                   cantap send -d COM5 -b 250k can0 'Dashboard:Speed=88' --db car.dbc")]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
-    /// can0 or 1, can1 or 2.
-    #[arg(value_parser = channel_args::channel)]
+    #[command(flatten)]
+    device: OneBoard,
+    /// 1 or 2; can0 is channel 1, can1 is channel 2.
+    #[arg(value_parser = channel)]
     channel: Channel,
     /// The frames, in this order.
     #[arg(required = true, value_name = "FRAME")]
@@ -64,6 +65,20 @@ pub struct Args {
     /// Print nothing about frames that were sent.
     #[arg(short, long)]
     quiet: bool,
+    /// Print one JSON object at the end, and nothing about single frames.
+    #[arg(long)]
+    json: bool,
+}
+
+/// A channel; a frame in its place shows that it was forgotten.
+fn channel(text: &str) -> Result<Channel, String> {
+    args::channel(text).map_err(|reason| {
+        if text.contains(['#', ':']) {
+            format!("say on which channel before the frame, as in: cantap send 1 {text}")
+        } else {
+            reason
+        }
+    })
 }
 
 /// Runs it.
@@ -75,7 +90,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let device = args.device.open()?;
     args.open.open(&device, [args.channel].into_iter(), Mode::Normal, None)?;
-    let mut sending = Sending::new(&device, args.open.rescue(), args.quiet);
+    let mut sending = Sending::new(&device, args.open.rescue(), args.quiet || args.json);
+    let started = Instant::now();
     let asked = match (triggers, periodic) {
         (Some(triggers), _) => {
             let slots = device.hello().trigger_slots;
@@ -111,7 +127,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         (None, None) => args.send_now(&device, &frames, &mut sending)?,
     };
     let outcome = sending.outcome(asked)?;
+    let seconds = started.elapsed().as_secs_f64();
     device.stop()?;
+    if args.json {
+        let mut object = outcome.object();
+        object["channel"] = args.channel.number().into();
+        object["sent"] = sending.sent().into();
+        object["seconds"] = rounded(seconds, 3).into();
+        writeln!(std::io::stdout().lock(), "{object}")?;
+    }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)
 }
@@ -120,7 +144,7 @@ impl Args {
     fn frames(&self) -> anyhow::Result<Vec<Frame>> {
         // A colon stands in no frame and in every message with values.
         let is_message = |text: &String| text.contains(':') && !text.contains('#');
-        let device = self.frames.iter().any(is_message).then_some(&self.device);
+        let device = self.device.given().filter(|_| self.frames.iter().any(is_message));
         let database = self.databases.or_of(device).load(false, self.quiet)?;
         let frame = |text: &String| {
             if is_message(text) {

@@ -9,7 +9,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::{Context, bail};
+use anyhow::Context;
 use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
 
 use self::windows::Windows;
@@ -30,14 +30,15 @@ before. Windows also count error frames, with their least length. Where frames w
 lower bound and says so.")]
 pub struct Args {
     /// The trace; - for standard input.
-    #[arg(value_name = "FILE", required_unless_present = "device")]
+    #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
-    /// Listen to a device instead of reading a file, until Ctrl-C.
+    /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
+    /// Without it and a file, the board that is connected is listened to.
     #[arg(short, long, conflicts_with = "input")]
-    device: Option<Address>,
+    device: Vec<Address>,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
-    /// repeated. A file has no load without it.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE", required_unless_present = "input")]
+    /// repeated. A file has no load without it; a device is listened to at the saved one.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
     bitrates: Vec<ChannelBitrate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), that channel's only. Can be
     /// repeated. Without it a channel with switched bit rates has no load.
@@ -48,11 +49,11 @@ pub struct Args {
         requires = "bitrates"
     )]
     data_bitrates: Vec<ChannelBitrate>,
-    /// The device's channel to listen to: 1, 2 or both.
-    #[arg(short, long, default_value = "both", requires = "device", value_parser = args::channels)]
+    /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
+    #[arg(short, long, default_value = "both", value_parser = args::channels)]
     channel: args::Channels,
-    /// Stop listening after this time.
-    #[arg(short = 't', long, value_name = "TIME", requires = "device", value_parser = args::positive_duration)]
+    /// Listen only for so long.
+    #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
@@ -84,12 +85,17 @@ impl Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let mut statistics = Statistics::new(args.options())?;
+    let live = if args.input.is_some() { None } else { Some(live::open(args)?) };
+    let mut options = args.options();
+    if let Some(live) = &live {
+        options.channel_bitrate_bps = live.bit_rates();
+    }
+    let mut statistics = Statistics::new(options)?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
     let mut ended = Ok(());
     let mut missing = Missing::default();
-    if let Some(address) = &args.device {
-        ended = live::run(args, address, &mut statistics, &mut windows);
+    if let Some(mut live) = live {
+        ended = live::run(args, &mut live, &mut statistics, &mut windows);
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {
@@ -105,8 +111,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         statistics.finish_with(&mut closed);
         missing = records.missing();
-    } else {
-        bail!("name a file, or a device with -d");
     }
     if statistics.channels().is_empty() {
         // Nothing was heard: the reason is all there is to say.

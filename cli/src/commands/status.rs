@@ -9,7 +9,7 @@ use cantap::wire::message::{ChannelStatus, Failures, Hello, Mode, RegisterSet, S
 use cantap::wire::record::{BusErrorKind, ErrorState};
 use serde_json::{Value, json};
 
-use crate::address::Address;
+use crate::boards::OneBoard;
 use crate::channel_args::{ChannelArgs, mode_name};
 use crate::wrong::wrong;
 use crate::{args, clock, interrupt};
@@ -24,14 +24,13 @@ use crate::{args, clock, interrupt};
                         cantap status -d virtual --registers --json"
 )]
 pub struct Args {
-    /// Where the device is: a serial port, or virtual.
-    #[arg(short, long)]
-    device: Address,
-    /// Open the channels for this time before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
+    #[command(flatten)]
+    device: OneBoard,
+    /// Open the channels for so long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
     #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.
-    #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels)]
+    #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels_of_one)]
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,

@@ -10,6 +10,8 @@ use super::app::{Column, View};
 pub struct Profile {
     /// The device's address, as after `-d`.
     pub device: Option<String>,
+    /// Several devices' addresses: their channels are numbered on.
+    pub devices: Vec<String>,
     /// Bit rates, as after `-b`: `["500k", "2:250k"]`.
     pub bitrates: Vec<String>,
     /// Take part in the bus instead of listening only.

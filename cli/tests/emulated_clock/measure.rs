@@ -5,7 +5,9 @@
 //! boards by their own. A round trip takes what the emulated bus and the firmware need for it; on each way, an operating system takes
 //! a random time on top.
 
-use cantap::device::{ClockMap, ClockReport, CommonClock, NotCommon, SofMark, Ticks, UtcNs};
+use std::sync::Arc;
+
+use cantap::device::{ClockMap, ClockReport, CommonClock, Follower, NotCommon, SofMark, Ticks, UtcNs};
 use cantap::wire::{Command, Event, Reply};
 use cantap_emu::Image;
 use cantap_emu::usb_host::Timing;
@@ -142,19 +144,30 @@ pub struct Clocks {
     /// The second board's time from the first one's: by the frames, and by each one's UTC with round trips alone.
     pub common: Result<Errors, NotCommon>,
     pub by_utc: Errors,
+    /// The second board's times put on the first one's clock while both run, as a capture does: beside what the first one's map has
+    /// for the same moment.
+    pub live: Errors,
 }
 
 /// Two boards on one computer, so many parts per million fast, for so many seconds of emulated time; errors count from `settled_s` on.
 pub fn measure(image: &Image, ppm: [f64; 2], seconds: u32, settled_s: u32) -> Result<Clocks, RigError> {
     let start = |ppm| Board::start(image.clone(), ppm).map(Box::new);
     let mut boards = [start(ppm[0])?, start(ppm[1])?];
-    let (mut alone, mut frames, mut by_utc) = (Vec::new(), Vec::new(), Vec::new());
+    let (mut alone, mut frames, mut by_utc, mut live) = (Vec::new(), Vec::new(), Vec::new(), Vec::new());
+    let mut follower = Follower::default();
     for second in 1..seconds {
         for board in &mut boards {
             board.run_until(f64::from(second))?;
             board.ask()?;
         }
+        let [first, other] = boards.each_ref().map(|board| Arc::new(board.frames.clone()));
+        follower.update(first, other);
         if second < settled_s {
+            // As records do that are not measured.
+            for place in 1..PLACES {
+                let ticks = boards[1].ticks(f64::from(second) + f64::from(place) / f64::from(PLACES));
+                follower.place(boards[1].frames.utc(ticks).0);
+            }
             continue;
         }
         for place in 1..PLACES {
@@ -165,6 +178,8 @@ pub fn measure(image: &Image, ppm: [f64; 2], seconds: u32, settled_s: u32) -> Re
             frames.push(off(boards[0].frames.utc(ticks)));
             let apart = boards[0].alone.utc(ticks).since(boards[1].alone.utc(other));
             by_utc.push(apart.abs() as f64 / 1e3);
+            let placed = follower.place(boards[1].frames.utc(other).0);
+            live.push((placed - boards[0].frames.utc(ticks).0).abs() as f64 / 1e3);
         }
     }
     let [first, second] = &mut boards;
@@ -182,5 +197,6 @@ pub fn measure(image: &Image, ppm: [f64; 2], seconds: u32, settled_s: u32) -> Re
         frames: (Errors::of(frames), first.frames.report()),
         common,
         by_utc: Errors::of(by_utc),
+        live: Errors::of(live),
     })
 }

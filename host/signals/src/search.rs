@@ -68,7 +68,7 @@ impl IdPattern {
 pub enum PatternError {
     /// No identifier.
     #[error(
-        "{0:?} is no identifier; write 3 hexadecimal digits or 8 (29 bits), with ? for any digit, or LOW-HIGH"
+        "{0:?} is no identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
     )]
     Id(String),
     /// No data.
@@ -109,13 +109,15 @@ impl FromStr for IdPattern {
         }
         let (value, mask) = digits(plain).ok_or_else(wrong)?;
         let (extended, largest) = match plain.len() {
-            3 => (false, Id::MAX_STANDARD),
-            8 => (true, Id::MAX_EXTENDED),
+            1..=3 => (false, Id::MAX_STANDARD),
+            // Too long for a standard one: the leading zeros are left out.
+            4..=8 => (true, Id::MAX_EXTENDED),
             _ => return Err(wrong()),
         };
         if value > largest {
             return Err(wrong());
         }
+        let mask = mask | u32::MAX.checked_shl(4 * plain.len() as u32).unwrap_or(0);
         Ok(Self { extended, kind: IdKind::Digits { value, mask } })
     }
 }

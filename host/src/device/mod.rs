@@ -16,6 +16,7 @@ mod reader;
 mod reconnect;
 #[cfg(feature = "serial")]
 mod serial;
+mod several;
 mod stamps;
 mod watch;
 
@@ -30,8 +31,8 @@ use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
 pub use clock::{
-    ClockMap, ClockReport, ClockSource, CommonClock, FrameClock, FrameDoubt, FrameNs, NotCommon, SofMark,
-    Ticks, UtcClock, UtcNs,
+    ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
+    FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
 };
 pub(crate) use error::no_timing;
 pub use error::{DeviceError, SessionOver};
@@ -41,6 +42,7 @@ pub use pipe::{PipeReader, PipeWriter, pipe};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
 pub use serial::{Board, list, port_of};
+pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
 
 use crate::TraceRecord;
@@ -318,8 +320,8 @@ impl Device {
 
     /// The map from the device's time to UTC as it is now, with the marks that it is made of. It goes on for as long as
     /// crystals keep their rate: some seconds. Before the device has told its time, one that maps tick 0 to the epoch.
-    pub fn clock_map(&self) -> ClockMap {
-        self.shared.clock_map().unwrap_or_else(|| ClockMap::new(self.hello.tick_hz, UtcNs(0)))
+    pub fn clock_map(&self) -> Arc<ClockMap> {
+        self.shared.clock_map().unwrap_or_else(|| Arc::new(ClockMap::new(self.hello.tick_hz, UtcNs(0))))
     }
 }
 

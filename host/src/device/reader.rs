@@ -68,7 +68,7 @@ pub(super) struct Shared {
     pub quit: AtomicBool,
     published: Mutex<Published>,
     /// After the last round trip.
-    clock_map: Mutex<Option<ClockMap>>,
+    clock_map: Mutex<Option<Arc<ClockMap>>>,
     changed: Condvar,
     pending: Mutex<Pending>,
 }
@@ -161,7 +161,7 @@ impl Shared {
     }
 
     /// The map from device time to UTC.
-    pub fn clock_map(&self) -> Option<ClockMap> {
+    pub fn clock_map(&self) -> Option<Arc<ClockMap>> {
         lock(&self.clock_map).clone()
     }
 
@@ -293,7 +293,7 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
             intake.count_host_losses(lost);
             if let Some((ticks, asked)) = times {
                 intake.add_time(ticks, asked, answered);
-                *lock(&shared.clock_map) = Some(intake.clock().clone());
+                *lock(&shared.clock_map) = Some(Arc::new(intake.clock().clone()));
             }
         }
         published.counters = *intake.counters();
@@ -352,7 +352,7 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
             }
             Order::SettleClock => {
                 intake.clock().settle();
-                *lock(&shared.clock_map) = Some(intake.clock().clone());
+                *lock(&shared.clock_map) = Some(Arc::new(intake.clock().clone()));
             }
             Order::Losses { channel, stage, count } => {
                 shared.buffer.push(intake.add_losses(channel, stage, count));

@@ -4,6 +4,9 @@
 //! What it sent does not: only who asked for that knows whether it is still wanted.
 
 use std::borrow::Borrow;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use cantap_wire::message::Mode;
@@ -40,19 +43,45 @@ pub struct Return {
     pub only_listening: Vec<Channel>,
 }
 
-/// Opens channels on a device that was not there before.
-type Setup<'a, D, E> = Box<dyn FnMut(&D) -> Result<(), E> + Send + 'a>;
-
 /// Connects to the device: the one with this serial number, if it is known and can be found by it.
-type Connect<'a, D, E> = Box<dyn FnMut(Option<&str>) -> Result<D, E> + Send + 'a>;
+type Connect<D, E> = Box<dyn FnMut(Option<&str>) -> Result<D, E> + Send>;
+/// Opens channels on a device that was not there before.
+type Setup<D, E> = Box<dyn FnMut(&D) -> Result<(), E> + Send>;
+
+/// Brings a device here and sets it up.
+struct Hands<D, E> {
+    connect: Connect<D, E>,
+    setup: Setup<D, E>,
+}
+
+/// A device that is there, with its channels open.
+struct Opened<D> {
+    handle: D,
+    records: Records,
+    known: Known,
+    back: Return,
+}
+
+/// The device being tried, in a thread of its own: a port that does not answer takes seconds, and whoever waits for
+/// records does not.
+struct Attempt<D, E> {
+    result: Receiver<Result<Opened<D>, E>>,
+    is_wanted: Arc<AtomicBool>,
+}
+
+impl<D, E> Drop for Attempt<D, E> {
+    fn drop(&mut self) {
+        self.is_wanted.store(false, Ordering::Relaxed);
+    }
+}
 
 /// A device that is opened again whenever it is there. `D` is the handle that connecting makes: a [`Device`], or what a program
 /// wraps around one.
-pub struct Reconnecting<'a, D, E> {
+pub struct Reconnecting<D, E> {
     /// What messages call it.
     name: String,
-    connect: Connect<'a, D, E>,
-    setup: Setup<'a, D, E>,
+    hands: Arc<Mutex<Hands<D, E>>>,
+    attempt: Option<Attempt<D, E>>,
     session: Option<(D, Records)>,
     known: Option<Known>,
     /// Counted in sessions that are over.
@@ -83,6 +112,7 @@ pub struct Gaps {
 }
 
 /// The board of the last session, and what it was to do.
+#[derive(Clone)]
 struct Known {
     board: String,
     serial: String,
@@ -100,19 +130,23 @@ impl Known {
     }
 }
 
-impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecting<'a, D, E> {
+impl<D, E> Reconnecting<D, E>
+where
+    D: Borrow<Device> + Send + 'static,
+    E: From<DeviceError> + std::fmt::Display + Send + 'static,
+{
     /// A device that need not be there yet; messages call it `name`. `connect` is given the serial number of the board that was
     /// there, if one was: `port_of` tells where it is now. `setup` opens its channels the first time; later they are opened as
     /// they were.
     pub fn new(
         name: &str,
-        connect: impl FnMut(Option<&str>) -> Result<D, E> + Send + 'a,
-        setup: impl FnMut(&D) -> Result<(), E> + Send + 'a,
+        connect: impl FnMut(Option<&str>) -> Result<D, E> + Send + 'static,
+        setup: impl FnMut(&D) -> Result<(), E> + Send + 'static,
     ) -> Self {
         Self {
             name: name.to_owned(),
-            connect: Box::new(connect),
-            setup: Box::new(setup),
+            hands: Arc::new(Mutex::new(Hands { connect: Box::new(connect), setup: Box::new(setup) })),
+            attempt: None,
             session: None,
             known: None,
             before: Counters::default(),
@@ -130,7 +164,14 @@ impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecti
 
     /// Connects now, to a device that must be there.
     pub fn connect(&mut self) -> Result<(), E> {
-        self.reconnect().map(|_| ())
+        let opened = open(&self.hands, &self.name, self.known.as_ref(), &AtomicBool::new(true))?;
+        self.welcome(opened);
+        Ok(())
+    }
+
+    /// How long it has been away by now; `None` while it is there.
+    pub fn away_for(&self) -> Option<Duration> {
+        self.gone.map(|(noticed_at, ago)| ago + noticed_at.elapsed())
     }
 
     /// The device, while it is there.
@@ -138,7 +179,7 @@ impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecti
         self.session.as_ref().map(|(handle, _)| handle.borrow())
     }
 
-    /// What comes next, waited for at most `timeout`; longer while a device that does not answer is tried again.
+    /// What comes next, waited for at most `timeout`.
     pub fn next(&mut self, timeout: Duration) -> Happening<E> {
         if let Some(next) = self.next.take() {
             return next;
@@ -170,6 +211,7 @@ impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecti
     /// there, or is lost on the way; then what follows ends as well.
     pub fn stop(&mut self) -> Result<(), E> {
         self.stopped = true;
+        self.attempt = None;
         let Some(device) = self.device() else {
             let reason = self.told.clone().unwrap_or_default();
             return Err(DeviceError::StillGone { address: self.name.clone(), reason }.into());
@@ -192,7 +234,7 @@ impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecti
 
     /// When it was not there, one that has not ended among them.
     pub fn gaps(&self) -> Gaps {
-        let open = self.gone.map(|(noticed_at, ago)| ago + noticed_at.elapsed());
+        let open = self.away_for();
         Gaps {
             count: self.gaps.count + u32::from(open.is_some()),
             time: self.gaps.time + open.unwrap_or_default(),
@@ -227,62 +269,113 @@ impl<'a, D: Borrow<Device>, E: From<DeviceError> + std::fmt::Display> Reconnecti
     }
 
     fn try_again(&mut self, timeout: Duration) -> Happening<E> {
-        let wait = self.retry_at.saturating_duration_since(Instant::now());
-        if wait > timeout {
-            std::thread::sleep(timeout);
-            return Happening::Records(Vec::new());
-        }
-        std::thread::sleep(wait);
-        match self.reconnect() {
-            Ok(back) => Happening::Back(back),
-            Err(error) => {
-                self.retry_at = Instant::now() + RETRY_AFTER;
-                let reason = error.to_string();
-                if self.told.as_ref() == Some(&reason) {
-                    return Happening::Records(Vec::new());
+        let deadline = Instant::now() + timeout;
+        let nothing = || Happening::Records(Vec::new());
+        let attempt = match self.attempt.take() {
+            Some(attempt) => attempt,
+            None if self.retry_at > deadline => {
+                std::thread::sleep(timeout);
+                return nothing();
+            }
+            None => {
+                std::thread::sleep(self.retry_at.saturating_duration_since(Instant::now()));
+                match self.start_attempt() {
+                    Ok(attempt) => attempt,
+                    Err(error) => return self.failed(DeviceError::Thread(error).into()),
                 }
-                self.told = Some(reason);
-                Happening::Gone(error)
+            }
+        };
+        match attempt.result.recv_timeout(deadline.saturating_duration_since(Instant::now())) {
+            Ok(Ok(opened)) => Happening::Back(self.welcome(opened)),
+            Ok(Err(error)) => self.failed(error),
+            Err(RecvTimeoutError::Timeout) => {
+                self.attempt = Some(attempt);
+                nothing()
+            }
+            // It panicked, and has said so.
+            Err(RecvTimeoutError::Disconnected) => {
+                self.retry_at = Instant::now() + RETRY_AFTER;
+                nothing()
             }
         }
     }
 
-    /// Opens the device, wherever it is now, and its channels.
-    fn reconnect(&mut self) -> Result<Return, E> {
-        let handle = (self.connect)(self.known.as_ref().map(|known| known.serial.as_str()))?;
-        let device: &Device = handle.borrow();
-        let hello = device.hello();
-        let mut back = Return::default();
-        let records = device.records();
-        match &self.known {
-            None => (self.setup)(&handle)?,
-            Some(known) if known.is(hello) => device.restore(&known.settings)?,
-            Some(known) => {
-                let name = Known::name(hello);
-                if known.can_clock_hz != hello.can_clock_hz {
-                    return Err(DeviceError::OtherClock { address: self.name.clone(), name }.into());
-                }
-                let mut settings = known.settings.clone();
-                back.only_listening = settings.only_listen();
-                back.other_board = Some(name);
-                device.restore(&settings)?;
-            }
+    fn start_attempt(&self) -> std::io::Result<Attempt<D, E>> {
+        let (sender, result) = sync_channel(1);
+        let is_wanted = Arc::new(AtomicBool::new(true));
+        let (hands, name, known) = (Arc::clone(&self.hands), self.name.clone(), self.known.clone());
+        let still_wanted = Arc::clone(&is_wanted);
+        std::thread::Builder::new().name("cantap-reconnect".to_owned()).spawn(move || {
+            // If nobody waits any more, the device is dropped, which closes it.
+            let _ = sender.send(open(&hands, &name, known.as_ref(), &still_wanted));
+        })?;
+        Ok(Attempt { result, is_wanted })
+    }
+
+    /// It is not there yet.
+    fn failed(&mut self, error: E) -> Happening<E> {
+        self.retry_at = Instant::now() + RETRY_AFTER;
+        let reason = error.to_string();
+        if self.told.as_ref() == Some(&reason) {
+            return Happening::Records(Vec::new());
         }
-        self.known = Some(Known {
-            board: hello.board.as_str().to_owned(),
-            serial: hello.serial.as_str().to_owned(),
-            can_clock_hz: hello.can_clock_hz,
-            settings: device.settings().clone(),
-        });
-        back.after = self.gone.take().map(|(noticed_at, ago)| ago + noticed_at.elapsed());
+        self.told = Some(reason);
+        Happening::Gone(error)
+    }
+
+    /// It is there.
+    fn welcome(&mut self, opened: Opened<D>) -> Return {
+        let Opened { handle, records, known, mut back } = opened;
+        self.known = Some(known);
+        back.after = self.away_for();
+        self.gone = None;
         if let Some(after) = back.after {
             self.gaps.count += 1;
             self.gaps.time += after;
         }
         self.told = None;
         self.session = Some((handle, records));
-        Ok(back)
+        back
     }
+}
+
+/// Opens a device, wherever it is now, and its channels: as before, if it is known.
+fn open<D: Borrow<Device>, E: From<DeviceError>>(
+    hands: &Mutex<Hands<D, E>>,
+    name: &str,
+    known: Option<&Known>,
+    is_wanted: &AtomicBool,
+) -> Result<Opened<D>, E> {
+    let mut hands = hands.lock().unwrap_or_else(PoisonError::into_inner);
+    let handle = (hands.connect)(known.map(|known| known.serial.as_str()))?;
+    let device: &Device = handle.borrow();
+    let hello = device.hello();
+    let mut back = Return::default();
+    let records = device.records();
+    if !is_wanted.load(Ordering::Relaxed) {
+        return Err(DeviceError::StillGone { address: name.to_owned(), reason: String::new() }.into());
+    }
+    match known {
+        None => (hands.setup)(&handle)?,
+        Some(known) if known.is(hello) => device.restore(&known.settings)?,
+        Some(known) => {
+            let board = Known::name(hello);
+            if known.can_clock_hz != hello.can_clock_hz {
+                return Err(DeviceError::OtherClock { address: name.to_owned(), name: board }.into());
+            }
+            let mut settings = known.settings.clone();
+            back.only_listening = settings.only_listen();
+            back.other_board = Some(board);
+            device.restore(&settings)?;
+        }
+    }
+    let known = Known {
+        board: hello.board.as_str().to_owned(),
+        serial: hello.serial.as_str().to_owned(),
+        can_clock_hz: hello.can_clock_hz,
+        settings: device.settings().clone(),
+    };
+    Ok(Opened { handle, records, known, back })
 }
 
 impl Settings {

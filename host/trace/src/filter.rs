@@ -17,6 +17,7 @@ pub const REMOTE: u32 = 1 << 30;
 /// The kernel keeps bit 29 for itself: it marks inverse filters and error frames.
 const RESERVED: u32 = 1 << 29;
 const STANDARD_BITS: u32 = 0x7FF;
+const EXTENDED_BITS: u32 = 0x1FFF_FFFF;
 
 /// One `ID:MASK` or `ID~MASK`.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
@@ -47,10 +48,15 @@ pub struct Filter {
 #[non_exhaustive]
 pub enum ParseFilterError {
     /// The part before the first comma.
-    #[error("'{0}' is no interface; write can0 for channel 1, can1 for channel 2, or any")]
+    #[error(
+        "'{0}' is neither an ID, such as 123, 123:7FF or 09F80102, nor an interface, such as can0 for channel 1, can1 for channel 2, \
+         or any"
+    )]
     Interface(String),
-    /// An ID without mask.
-    #[error("'{0}' is no filter; write ID:MASK, such as 123:7FF, or ID~MASK for everything else")]
+    /// Neither an ID nor an ID with a mask.
+    #[error(
+        "'{0}' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else"
+    )]
     Element(String),
     /// A number.
     #[error("'{0}' is no hexadecimal number of up to 8 digits")]
@@ -136,10 +142,21 @@ fn interface(text: &str) -> Result<Option<u8>, ParseFilterError> {
     }
 }
 
+/// An identifier without a mask is exactly that one: three digits at most for a standard one, more for one of 29 bits. candump wants
+/// the mask, but everybody forgets it.
+fn lone_id(text: &str) -> Option<IdFilter> {
+    let id = number(text).ok()?;
+    let (id, bits) = match text.len() {
+        ..=3 => (id, STANDARD_BITS),
+        _ => (id | EXTENDED, EXTENDED_BITS),
+    };
+    (id & !EXTENDED <= bits).then_some(IdFilter { id, mask: bits | EXTENDED, inverse: false })
+}
+
 impl FromStr for Filter {
     type Err = ParseFilterError;
 
-    /// The interface may be left out: `123:7FF` looks at every channel.
+    /// The interface may be left out: `123:7FF` looks at every channel. So may the mask: `123` is that identifier alone.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut filter = Self::default();
         for (at, part) in text.split(',').enumerate() {
@@ -150,6 +167,8 @@ impl FromStr for Filter {
                 let inverse = part.as_bytes()[id.len()] == b'~';
                 let id = number(id)? & !RESERVED | extended;
                 filter.ids.push(IdFilter { id, mask: number(mask)? & !RESERVED, inverse });
+            } else if let Some(id) = lone_id(part).filter(|_| at > 0 || interface(part).is_err()) {
+                filter.ids.push(id);
             } else if at == 0 {
                 filter.channel = interface(part)?;
             } else if part.eq_ignore_ascii_case("j") {
@@ -191,6 +210,19 @@ mod tests {
 
     fn accepts(filter: &str, frame: &str) -> bool {
         filter.parse::<Filter>().unwrap().accepts_frame(&frame.parse().unwrap())
+    }
+
+    #[test]
+    fn an_identifier_without_a_mask_is_exactly_that_one() {
+        assert!(accepts("123", "123#") && accepts("123", "123#R") && accepts("can0,123", "123#"));
+        assert!(!accepts("123", "124#") && !accepts("123", "00000123#"));
+        assert!(accepts("9F80102", "09F80102#") && accepts("09F80102", "09F80102#11"));
+        assert!(!accepts("9F80102", "09F80103#") && accepts("can0,100,200", "200#"));
+        // Letters and a number are an interface first.
+        assert_eq!("ca0".parse::<Filter>().unwrap().channel, Some(1));
+        for text in ["800", "3FFFFFFF", "123456789", "12g", ","] {
+            assert!(text.parse::<Filter>().is_err() || text == ",", "{text}");
+        }
     }
 
     /// The examples of candump's own help.

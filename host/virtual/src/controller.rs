@@ -67,6 +67,8 @@ pub struct Controller {
     last_error: u32,
     /// Left to wait in bus-off, in nanoseconds of model time at which it ends; set by the machine.
     recovers_at_ns: Option<u64>,
+    /// It was started while bus-off: initialisation mode was entered and left, which begins the recovery.
+    is_told_to_recover: bool,
     /// Set when something happened, taken by the machine.
     pub interrupts: Interrupts,
     /// Frames on the bus that passed the filters while the controller took part, delivered to the FIFO or not.
@@ -95,6 +97,7 @@ impl Controller {
             error: None,
             last_error: 0,
             recovers_at_ns: None,
+            is_told_to_recover: false,
             interrupts: Interrupts::default(),
             heard: 0,
             driven: 0,
@@ -112,7 +115,11 @@ impl Controller {
 
     /// Called as time passes: ends bus-off when its time is over.
     pub fn pass(&mut self, now_ns: u64) {
-        if self.state() != ErrorState::BusOff || self.config.is_some_and(|config| config.manual_recovery) {
+        let is_manual = self.config.is_some_and(|config| config.manual_recovery);
+        if self.state() != ErrorState::BusOff
+            || self.phase == Phase::Off
+            || is_manual && !self.is_told_to_recover
+        {
             return;
         }
         let wait_ns = RECOVERY_BITS * 1_000_000_000 / u64::from(self.bitrate_bps.max(1));
@@ -127,6 +134,15 @@ impl Controller {
         self.tec = 0;
         self.rec = 0;
         self.recovers_at_ns = None;
+        self.is_told_to_recover = false;
+    }
+
+    /// Initialisation mode is left. It does not touch the error counters: only the controller's reset does, and the sequence
+    /// that ends bus-off, which begins here (RM0090 Rev 21 §32.7.6).
+    fn begin(&mut self) {
+        self.recovers_at_ns = None;
+        self.is_told_to_recover = self.state() == ErrorState::BusOff;
+        self.phase = Phase::Joining;
     }
 
     fn mode(&self) -> Option<Mode> {
@@ -383,8 +399,11 @@ impl Control for ControlSide {
         }
     }
 
+    /// By the controller's own reset, which clears its error counters.
     fn halt(&mut self) {
-        self.0.borrow_mut().leave();
+        let mut controller = self.0.borrow_mut();
+        controller.leave();
+        controller.clear_errors();
     }
 
     fn is_stopped(&self) -> bool {
@@ -398,14 +417,11 @@ impl Control for ControlSide {
         controller.fifo.clear();
         controller.overrun = false;
         controller.error = None;
-        controller.clear_errors();
-        controller.phase = Phase::Joining;
+        controller.begin();
     }
 
     fn resume(&mut self) {
-        let mut controller = self.0.borrow_mut();
-        controller.clear_errors();
-        controller.phase = Phase::Joining;
+        self.0.borrow_mut().begin();
     }
 }
 

@@ -399,6 +399,26 @@ fn errors_states_and_recovery_are_told_in_order_and_every_error_counted() {
     assert!(!events.iter().any(|event| matches!(event, TraceEvent::State { state: BusOff, .. })));
 }
 
+/// As on the board (`sim/tests/live_bus.rs`): initialisation mode does not touch them.
+#[test]
+fn error_counters_outlive_closing_and_opening() {
+    let device = open(Options { acknowledge: false, ..options(0.0, Frames::Std8) });
+    device.open_channel(Channel::Can1, Some(config(&device, Mode::Normal))).unwrap();
+    let frame: Frame = "100#01".parse().unwrap();
+    device.send(Channel::Can1, &[TxFrame { tag: 1, frame, at_ticks: None }]).unwrap();
+    let deadline = Instant::now() + Duration::from_secs(10);
+    while device.status().unwrap().channels[0].tec < 128 {
+        assert!(Instant::now() < deadline);
+    }
+    device.abort(Channel::Can1).unwrap();
+    device.close_channel(Channel::Can1).unwrap();
+    device.open_channel(Channel::Can1, Some(config(&device, Mode::ListenOnly))).unwrap();
+    // The firmware reads the counters once a millisecond.
+    std::thread::sleep(Duration::from_millis(30));
+    let state = device.status().unwrap().channels[0];
+    assert_eq!((state.tec, state.state), (128, ErrorState::Passive));
+}
+
 #[test]
 fn a_channel_with_manual_recovery_stays_off_until_it_is_told_to_come_back() {
     let device = open(Options { disturb: 32, ..options(0.0, Frames::Std8) });

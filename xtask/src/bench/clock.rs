@@ -37,6 +37,7 @@ pub fn run() -> Result<()> {
         line("UTC by USB frames and round trips", clocks.frames.0);
         line("one board's time from the other's, by each UTC", clocks.by_utc);
         line("one board's time from the other's, by frames", clocks.common?);
+        line("the same while both run, as in a capture", clocks.live);
         let bound = |report: ClockReport| report.uncertainty_ns.map_or(f64::NAN, |ns| ns as f64 / 1e3);
         println!(
             "  bounds that the clock tells at the end: {:.0} us by round trips alone, {:.0} us by frames",

@@ -1,40 +1,35 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
-use std::io::IsTerminal;
 use std::time::{SystemTime, UNIX_EPOCH};
 
-use anyhow::{Context, bail};
 use cantap_analysis::stats::{Statistics, Window};
 
 use super::Args;
 use super::table::remarks;
 use super::windows::Windows;
-use crate::address::Address;
+use crate::boards::Boards;
 use crate::live::LiveRecords;
+use crate::stderr;
 
 /// How long after its end a window is closed, so that what is still on the way gets into it.
 const LATENESS_NS: i64 = 1_000_000_000;
 /// Columns of the bar for 100 %.
 const BAR_COLUMNS: usize = 20;
 
+/// Opens the devices that the command line names, else the one that is connected.
+pub(super) fn open(args: &Args) -> anyhow::Result<LiveRecords> {
+    let boards = Boards::new(&args.device, &args.channel)
+        .map_err(|error| error.context("without a trace to measure, a device is listened to"))?;
+    LiveRecords::listen(&boards, &args.bitrates, args.time)
+}
+
 /// Listens until Ctrl-C or the end of the time. What was heard counts, even where this fails.
 pub(super) fn run(
     args: &Args,
-    address: &Address,
+    live: &mut LiveRecords,
     statistics: &mut Statistics,
     windows: &mut Option<Windows>,
 ) -> anyhow::Result<()> {
-    let options = args.options();
-    let channels = args.channel;
-    let mut live = LiveRecords::open(address, args.time, move |device| {
-        for channel in channels.iter() {
-            let Some(bitrate) = options.bitrate_of(channel.number()) else {
-                bail!("channel {0} has no bit rate; give one with -b, such as -b {0}:500k", channel.number());
-            };
-            device.listen(channel, bitrate).with_context(|| format!("channel {}", channel.number()))?;
-        }
-        Ok(())
-    })?;
     let mut show = Lines::new(!args.json);
     let mut keep = |window: &Window| {
         show.window(window);
@@ -72,8 +67,7 @@ struct Lines {
 
 impl Lines {
     fn new(shown: bool) -> Self {
-        let colour = std::io::stderr().is_terminal() && std::env::var_os("NO_COLOR").is_none();
-        Self { shown, colour }
+        Self { shown, colour: stderr::is_coloured() }
     }
 
     fn window(&mut self, window: &Window) {
@@ -94,7 +88,7 @@ fn line(window: &Window, colour: bool) -> String {
         _ => ("\x1b[32m", "\x1b[0m"),
     };
     let text = format!(
-        "can{} {:>7.0} frames/s {:>8.0} bit/s {load:>5.1} % |{on}{bar:.<BAR_COLUMNS$}{off}|",
+        "channel {} {:>7.0} frames/s {:>8.0} bit/s {load:>5.1} % |{on}{bar:.<BAR_COLUMNS$}{off}|",
         window.channel,
         window.frames_per_s(),
         window.bits_per_s(),

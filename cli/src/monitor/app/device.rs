@@ -11,14 +11,27 @@ use crate::address::{Address, AddressError};
 use crate::channel_bitrate::ChannelBitrate;
 
 impl App {
-    /// Between listen-only and taking part.
+    /// Between listen-only and taking part, which is asked for: whatever acknowledges changes the bus.
     pub(super) fn toggle_mode(&mut self) {
-        let Some(plan) = &mut self.plan else {
-            "a file has no mode".clone_into(&mut self.message);
-            return;
-        };
-        let other = if plan.mode().transmits() { Mode::ListenOnly } else { Mode::Normal };
-        plan.open.set_mode(other);
+        match &self.plan {
+            None => "a file has no mode".clone_into(&mut self.message),
+            Some(plan) if plan.mode().transmits() => self.set_mode(Mode::ListenOnly),
+            Some(_) => self.ask(PromptKind::Normal, ""),
+        }
+    }
+
+    /// Whether to take part was answered: only a clear yes is one.
+    pub(super) fn answer_normal(&mut self, text: &str) {
+        if matches!(text.to_ascii_lowercase().as_str(), "y" | "yes") {
+            self.set_mode(Mode::Normal);
+        } else {
+            "it stays listen-only".clone_into(&mut self.message);
+        }
+    }
+
+    fn set_mode(&mut self, mode: Mode) {
+        let Some(plan) = &mut self.plan else { return };
+        plan.open.set_mode(mode);
         let order = Order::Open(plan.clone());
         self.order(order);
     }
@@ -31,10 +44,7 @@ impl App {
         let rates: Vec<_> = plan
             .channels
             .iter()
-            .filter_map(|channel| {
-                let number = channel.number();
-                Some(format!("{number}:{}", model.options().bitrate_of(number)?))
-            })
+            .filter_map(|number| Some(format!("{number}:{}", model.options().bitrate_of(*number)?)))
             .collect();
         self.ask(PromptKind::BitRate, &rates.join(" "));
     }
@@ -50,20 +60,27 @@ impl App {
         }
         let mut plan = plan.clone();
         plan.set_bit_rates(rates);
-        plan.open.timing.check_channels().map_err(|error| error.to_string())?;
+        plan.open.timing.check_channels(plan.addresses.len()).map_err(|error| error.to_string())?;
         self.open(plan, model)
     }
 
     pub(super) fn set_device(&mut self, text: &str, model: &Model) -> Result<(), String> {
-        let address: Address = text.parse().map_err(|error: AddressError| error.to_string())?;
+        let addresses = text.split(" + ").map(|address| address.trim().parse::<Address>());
+        let addresses =
+            addresses.collect::<Result<Vec<_>, _>>().map_err(|error: AddressError| error.to_string())?;
         let plan = match &self.plan {
-            Some(plan) => Plan { address, ..plan.clone() },
-            None => Plan::listening(address, model.options()),
+            Some(plan) => plan.at(addresses),
+            None => Plan::listening(addresses, model.options()),
         };
         self.open(plan, model)
     }
 
-    fn open(&mut self, plan: Plan, model: &Model) -> Result<(), String> {
+    /// Opens another device, or at other bit rates: whatever was agreed to before was for another bus, so it only listens.
+    fn open(&mut self, mut plan: Plan, model: &Model) -> Result<(), String> {
+        if plan.mode() != Mode::ListenOnly {
+            plan.open.set_mode(Mode::ListenOnly);
+            "listen-only now; m takes part in the bus".clone_into(&mut self.message);
+        }
         let options =
             cantap_analysis::stats::Options { window: LOAD_WINDOW, ..plan.options(model.options()) };
         Statistics::new(options).map_err(|error| error.to_string())?;

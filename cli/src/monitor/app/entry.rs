@@ -2,18 +2,19 @@
 
 use std::time::Duration;
 
-use cantap::{Channel, Frame};
+use cantap::Frame;
 use cantap_signals::encode;
 
 use super::super::model::Model;
+use crate::args::MOST_CHANNELS;
 
 /// A frame in the send list.
 #[derive(Clone, Debug, PartialEq)]
 pub struct SendEntry {
     /// As typed: a frame, or a message with its signals.
     pub text: String,
-    /// Where to.
-    pub channel: Channel,
+    /// Where to: the channel's number, from 1.
+    pub channel: u8,
     /// The frame.
     pub frame: Frame,
     /// How often; once per key without.
@@ -34,17 +35,20 @@ pub fn parse_entry(text: &str, model: &Model) -> Result<SendEntry, String> {
         return Err("a period must be longer than nothing, such as 100ms".to_owned());
     }
     let (channel, what) = match what.split_once(':') {
-        Some((number @ ("1" | "2"), what)) => (number.parse().ok().and_then(Channel::from_number), what),
+        Some((number, what))
+            if number.parse().is_ok_and(|number: u8| (1..=MOST_CHANNELS).contains(&number)) =>
+        {
+            (number.parse().ok(), what)
+        }
         _ => (None, what),
     };
     let (frame, of_database) = if what.contains('#') {
         (what.parse::<Frame>().map_err(|error| error.to_string())?, None)
     } else {
-        let number = channel.map(Channel::number);
         let encoded =
-            encode::encode(model.seen.signals.decoder(), number, what).map_err(|error| error.to_string())?;
-        (encoded.frame, encoded.channel.and_then(Channel::from_number))
+            encode::encode(model.seen.signals.decoder(), channel, what).map_err(|error| error.to_string())?;
+        (encoded.frame, encoded.channel)
     };
-    let channel = channel.or(of_database).unwrap_or(Channel::Can1);
+    let channel = channel.or(of_database).unwrap_or(1);
     Ok(SendEntry { text: text.to_owned(), channel, frame, period, slot: None, sent: 0 })
 }

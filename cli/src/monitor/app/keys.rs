@@ -3,7 +3,7 @@
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::model::Model;
-use super::super::source::Order;
+use super::super::source::{Order, Plan};
 use super::super::views::{self, trace};
 use super::line::PromptKind;
 use super::state::{App, Direction, Flow, View};
@@ -62,8 +62,7 @@ impl App {
             KeyCode::Char('A') if self.plan.is_some() => self.order(Order::Autobaud),
             KeyCode::Char('A') => "a file has no bit rate to be found".clone_into(&mut self.message),
             KeyCode::Char('D') => {
-                let address =
-                    self.plan.as_ref().map_or("virtual".to_owned(), |plan| plan.address.to_string());
+                let address = self.plan.as_ref().map_or("virtual".to_owned(), Plan::name);
                 self.ask(PromptKind::Device, &address);
             }
             KeyCode::Char('m') => self.toggle_mode(),

@@ -70,6 +70,8 @@ pub enum PromptKind {
     BitRate,
     /// A device.
     Device,
+    /// Whether to take part in the bus.
+    Normal,
 }
 
 /// A line of input.

@@ -12,6 +12,7 @@ mod sending;
 mod state;
 
 use super::model::Model;
+use crate::boards::place_of;
 
 pub use column::Column;
 pub use entry::{SendEntry, parse_entry};
@@ -25,10 +26,12 @@ impl App {
         if let Some(plan) = model.found.take() {
             self.plan = Some(plan);
         }
-        if self.session != model.sessions {
-            self.session = model.sessions;
+        if self.sessions != model.sessions {
+            let known = std::mem::replace(&mut self.sessions, model.sessions.clone());
+            let is_new = |board: usize| known.get(board) != model.sessions.get(board);
             // A device forgets what it was to send periodically when its session ends.
-            let were_on = self.send.iter_mut().filter_map(|entry| entry.slot.take()).count();
+            let entries = self.send.iter_mut().filter(|entry| is_new(place_of(entry.channel).0));
+            let were_on = entries.filter_map(|entry| entry.slot.take()).count();
             if were_on > 0 {
                 let said = std::mem::take(&mut model.notice);
                 let before = if said.is_empty() { "a new session" } else { &said };

@@ -44,6 +44,10 @@ impl App {
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::BitRate => self.set_bit_rates(text, model),
             PromptKind::Device => self.set_device(text, model),
+            PromptKind::Normal => {
+                self.answer_normal(text);
+                Ok(())
+            }
         };
         if let Err(reason) = result {
             self.message = reason;

@@ -121,8 +121,8 @@ pub struct App {
     pub clipboard: Option<String>,
     /// The device and its buses, if the source is one.
     pub plan: Option<Plan>,
-    /// The device's session that the send list's periodic entries belong to.
-    pub(super) session: u32,
+    /// The sessions of the devices that the send list's periodic entries belong to.
+    pub(super) sessions: Vec<u32>,
     /// Where orders for the source go.
     pub orders: Sender<Order>,
 }
@@ -183,7 +183,7 @@ impl App {
             message: String::new(),
             clipboard: None,
             plan,
-            session: 0,
+            sessions: Vec::new(),
             orders,
         }
     }

@@ -9,13 +9,14 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
+use cantap::TraceRecord;
 use cantap::device::{ClockReport, Counters};
 use cantap::wire::message::Status;
-use cantap::{Channel, TraceRecord};
 use cantap_analysis::stats::{Options, Statistics, Window};
 use cantap_signals::Decoder;
 
 use super::source::Plan;
+use crate::hearing::Hearing;
 
 pub use fixed::{FixedTable, Row};
 pub use history::History;
@@ -92,8 +93,8 @@ pub struct Seen {
     pub statistics: Statistics,
     /// The load of the last windows, per channel, the newest last.
     pub loads: Vec<(u8, VecDeque<Window>)>,
-    /// The device, if the source is one.
-    pub device: Option<DeviceFigures>,
+    /// The devices, if the source is some.
+    pub devices: Vec<DeviceFigures>,
     /// Records taken.
     pub taken: u64,
     /// The time, as far as it is known from the last record, in nanoseconds as in [`TraceRecord::time_ns`]. A file that
@@ -120,12 +121,14 @@ pub struct Model {
     pub first_ns: Option<i64>,
     /// The source.
     pub source: SourceState,
-    /// How often a device was opened: with another session, what it sent periodically has ended.
-    pub sessions: u32,
+    /// How often each device was opened: with another session, what it sent periodically has ended.
+    pub sessions: Vec<u32>,
     /// The plan with the bit rates that were found by listening, until the display has taken it over.
     pub found: Option<Plan>,
     /// Periodic transmissions that the device refused, by channel and slot, until the display has taken note.
-    pub refused: Vec<(Channel, u8)>,
+    pub refused: Vec<(u8, u8)>,
+    /// What the device's channels hear.
+    pub hearing: Hearing,
     /// Places in the file played back that could not be read, and what was wrong with the first of them.
     pub unread: Option<(u64, String)>,
     /// The recording, if one runs.
@@ -144,7 +147,7 @@ impl Model {
             signals: SignalTable::new(decoder),
             statistics: Statistics::new(options.clone())?,
             loads: Vec::new(),
-            device: None,
+            devices: Vec::new(),
             taken: 0,
             now_ns: 0,
         };
@@ -153,9 +156,10 @@ impl Model {
             seen,
             first_ns: None,
             source: SourceState::default(),
-            sessions: 0,
+            sessions: Vec::new(),
             found: None,
             refused: Vec::new(),
+            hearing: Hearing::default(),
             unread: None,
             recording: None,
             notice: String::new(),

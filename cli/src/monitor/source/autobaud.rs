@@ -4,6 +4,9 @@ use std::sync::mpsc::TryRecvError;
 
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
+use cantap::device::channel_number;
+use cantap::wire::message::Mode;
+
 use super::super::model::SourceState;
 use super::{Plan, Source, Then, lock};
 use crate::advice;
@@ -13,34 +16,39 @@ impl Source<'_> {
     /// Puts the bit rates that are found into the plan; what is not found stays as it was. Says what is to be done
     /// after it: an order may have come meanwhile.
     pub(super) fn autobaud(&mut self, plan: &mut Plan) -> Then {
-        let device = match plan.address.open() {
-            Ok(device) => device,
-            Err(error) => {
-                self.notice(advice::sentence(&error));
-                return Then::GoOn;
-            }
-        };
         lock(self.model).source = SourceState::Searching;
         let mut said = Vec::new();
         let mut rates = Vec::new();
         let mut then = Then::GoOn;
-        for channel in &plan.channels {
-            let number = channel.number();
-            let mut progress = |progress: Progress| {
-                self.notice(format!("channel {number}: {}; A stops", describe(progress)));
-                then = self.order_meanwhile();
-                matches!(then, Then::GoOn)
-            };
-            said.push(match autobaud::search(&device, *channel, &Limits::default(), &mut progress) {
-                Ok(Outcome::Found { bitrate_bps, .. }) => {
-                    rates.push(ChannelBitrate { channel: Some(number), bitrate_bps });
-                    format!("channel {number}: {bitrate_bps} bit/s")
+        for (board, address) in plan.addresses.iter().enumerate() {
+            let device = match address.open() {
+                Ok(device) => device,
+                Err(error) => {
+                    said.push(advice::sentence(&error));
+                    continue;
                 }
-                Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
-                Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
-                Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
-                Err(error) => format!("channel {number}: {}", advice::told(&error)),
-            });
+            };
+            for channel in plan.channels_of(board) {
+                let number = channel_number(board, channel);
+                let mut progress = |progress: Progress| {
+                    self.notice(format!("channel {number}: {}; A stops", describe(progress)));
+                    then = self.order_meanwhile();
+                    matches!(then, Then::GoOn)
+                };
+                said.push(match autobaud::search(&device, channel, &Limits::default(), &mut progress) {
+                    Ok(Outcome::Found { bitrate_bps, .. }) => {
+                        rates.push(ChannelBitrate { channel: Some(number), bitrate_bps });
+                        format!("channel {number}: {bitrate_bps} bit/s")
+                    }
+                    Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
+                    Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
+                    Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
+                    Err(error) => format!("channel {number}: {}", advice::told(&error)),
+                });
+                if !matches!(then, Then::GoOn) {
+                    break;
+                }
+            }
             if !matches!(then, Then::GoOn) {
                 break;
             }
@@ -49,10 +57,46 @@ impl Source<'_> {
             // Behind the others: the last one counts.
             rates.splice(0..0, plan.open.timing.bitrates.clone());
             plan.open.timing.set_bit_rates(rates);
+            if plan.mode() != Mode::ListenOnly {
+                // It was agreed to at another bit rate.
+                plan.open.set_mode(Mode::ListenOnly);
+                said.push("listen-only now".to_owned());
+            }
             lock(self.model).found = Some(plan.clone());
         }
         self.notice(said.join("; "));
         then
+    }
+
+    /// Whether a channel that is to be opened has a bit rate from nowhere: not given, and not saved on its device. A device that is
+    /// not there tells so when it is opened.
+    pub(super) fn lacks_bit_rates(plan: &Plan) -> bool {
+        if plan.open.timing.is_given() {
+            return false;
+        }
+        plan.addresses.iter().enumerate().any(|(board, address)| {
+            let Ok(device) = address.open() else { return false };
+            let lacks = |channel| {
+                device.bitrate_of_bus(channel).is_none()
+                    && device.defaults(channel).is_ok_and(|saved| saved.is_none())
+            };
+            plan.channels_of(board).any(lacks)
+        })
+    }
+
+    /// Looks for the bit rates of a plan that has none, until at least one is found. What has none then is not opened.
+    pub(super) fn find_bit_rates(&mut self, plan: &mut Plan) -> Then {
+        loop {
+            let then = self.autobaud(plan);
+            if plan.open.timing.is_given() {
+                plan.choose_channels();
+                lock(self.model).found = Some(plan.clone());
+                return then;
+            }
+            if !matches!(then, Then::GoOn) {
+                return then;
+            }
+        }
     }
 
     /// What was ordered during the search; anything that concerns the device ends it.

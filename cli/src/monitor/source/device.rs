@@ -1,34 +1,48 @@
 //! A device as the source: session after session, whenever it is there.
 
+use std::collections::VecDeque;
 use std::sync::mpsc::TryRecvError;
 use std::time::{Duration, Instant};
 
-use cantap::device::{Happening, Return, UtcClock};
+use cantap::device::{Happening, Return, UtcClock, channel_number};
 use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
-use cantap::{Channel, Device, Frame, TraceEvent, TraceRecord};
+use cantap::{Frame, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
 use super::{FIGURES_EVERY, Order, Plan, Source, Then, WAIT, lock};
 use crate::advice;
-use crate::live::{Line, line};
+use crate::boards::place_of;
+use crate::hearing::Hearing;
+use crate::live::{Line, Lines, lines};
 
 /// How long after its end a window is closed when nothing comes, so that a late frame still finds it open.
 const LATENESS_NS: i64 = 1_000_000_000;
 
 impl Source<'_> {
     pub(super) fn run_device(&mut self, mut plan: Plan) {
-        let mut reconnects = 0;
+        let mut reconnects = vec![0; plan.addresses.len()];
+        if Self::lacks_bit_rates(&plan) {
+            match self.find_bit_rates(&mut plan) {
+                Then::GoOn | Then::Autobaud => {}
+                Then::Reopen(other) => plan = other,
+                Then::Quit => return,
+            }
+        }
         loop {
-            let mut line = open_as(&plan);
-            let then = self.listen(&plan, &mut line, reconnects);
-            reconnects += line.gaps().count;
-            if line.device().is_some() {
-                self.end(&mut line);
+            let mut lines = open_as(&plan);
+            reconnects.resize(plan.addresses.len(), 0);
+            lock(self.model).hearing = Hearing::default();
+            let then = self.listen(&plan, &mut lines, &reconnects);
+            for (count, line) in reconnects.iter_mut().zip(lines.lines()) {
+                *count += line.gaps().count;
+            }
+            if lines.devices().next().is_some() {
+                self.end(&mut lines);
                 if !matches!(then, Then::Quit) {
                     self.note_gap(&plan.channels);
                 }
             }
-            drop(line);
+            drop(lines);
             match then {
                 Then::GoOn => {}
                 Then::Autobaud => match self.autobaud(&mut plan) {
@@ -37,9 +51,11 @@ impl Source<'_> {
                     Then::GoOn | Then::Autobaud => {}
                 },
                 Then::Reopen(other) => {
-                    if other.address != plan.address {
-                        reconnects = 0;
-                        lock(self.model).begin_statistics();
+                    if other.addresses != plan.addresses {
+                        reconnects.clear();
+                        let mut model = lock(self.model);
+                        model.begin_statistics();
+                        model.seen.devices.clear();
                     }
                     plan = other;
                 }
@@ -48,37 +64,52 @@ impl Source<'_> {
         }
     }
 
-    /// Takes what comes, while the device is there and when it is back, and follows orders, until one ends it.
-    fn listen(&mut self, plan: &Plan, line: &mut Line, reconnects: u32) -> Then {
+    /// Takes what comes, while the devices are there and when they are back, and follows orders, until one ends it.
+    fn listen(&mut self, plan: &Plan, lines: &mut Lines, reconnects: &[u32]) -> Then {
         let clock = UtcClock::start();
         let mut next_figures = Instant::now();
-        let mut pace = None;
+        let mut paces = vec![None; plan.addresses.len()];
+        // Devices of which nothing is known yet, and what was ordered meanwhile.
+        let mut unknown = vec![true; plan.addresses.len()];
+        let mut early = VecDeque::new();
+        lock(self.model).source = SourceState::Starting;
         loop {
-            match line.next(WAIT) {
-                Happening::Records(batch) => self.hand_over(batch, line),
-                Happening::Gone(error) => {
+            match lines.next(WAIT) {
+                (_, Happening::Records(batch)) => self.hand_over(batch, lines),
+                (board, Happening::Gone(error)) => {
+                    unknown[board] = false;
                     let mut model = lock(self.model);
-                    model.source = SourceState::Gone(advice::sentence(&error));
+                    let reason = advice::sentence(&error);
+                    if lines.devices().next().is_none() {
+                        model.source = SourceState::Gone(reason);
+                    } else {
+                        model.notice = format!("{reason}; the other devices go on");
+                    }
                     model.interrupt();
                 }
-                Happening::Back(back) => {
-                    let reconnects = reconnects + line.gaps().count;
-                    pace = None;
-                    if let Some(device) = line.device() {
-                        self.greet(device, plan, &back, reconnects);
-                    }
+                (board, Happening::Back(back)) => {
+                    let reconnects = reconnects.get(board).copied().unwrap_or_default();
+                    paces[board] = None;
+                    unknown[board] = false;
+                    self.greet(board, lines, plan, &back, reconnects);
                 }
                 // Nobody has stopped it.
-                Happening::Ended => return Then::GoOn,
+                (_, Happening::Ended) => return Then::GoOn,
             }
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;
-                self.show_figures(line, &clock, &mut pace);
+                self.show_figures(lines, &clock, &mut paces);
                 self.show_recording();
             }
             loop {
-                let followed = match self.orders.try_recv() {
-                    Ok(order) => self.follow_with(line.device(), order),
+                let is_known = !unknown.contains(&true);
+                let waited = if is_known { early.pop_front() } else { None };
+                let followed = match waited.map_or_else(|| self.orders.try_recv(), Ok) {
+                    Ok(order @ (Order::Send(..) | Order::SetPeriodic(..))) if !is_known => {
+                        early.push_back(order);
+                        Then::GoOn
+                    }
+                    Ok(order) => self.follow_with(lines, order),
                     Err(TryRecvError::Empty) => break,
                     Err(TryRecvError::Disconnected) => Then::Quit,
                 };
@@ -90,66 +121,87 @@ impl Source<'_> {
     }
 
     /// Ends the session; what was captured until then is shown and recorded.
-    fn end(&mut self, line: &mut Line) {
-        // If that fails the device has just gone, and what was ordered still counts.
-        let _ = line.stop();
+    fn end(&mut self, lines: &mut Lines) {
+        // If that fails a device has just gone, and what was ordered counts all the same.
+        let _ = lines.stop();
         loop {
-            match line.next(WAIT) {
-                Happening::Records(batch) => self.hand_over(batch, line),
+            match lines.next(WAIT).1 {
+                Happening::Records(batch) => self.hand_over(batch, lines),
                 Happening::Gone(_) | Happening::Back(_) => {}
                 Happening::Ended => return,
             }
         }
     }
 
-    fn show_figures(&self, line: &Line, clock: &UtcClock, pace: &mut Option<Pace>) {
-        let Some(device) = line.device() else { return };
-        // If it does not answer, the stream says so.
-        let Ok(status) = device.status() else { return };
-        let now_ns = clock.at(Instant::now()).0;
-        let pace = pace.get_or_insert_with(|| Pace::new(now_ns, status.ticks, device.hello().tick_hz));
-        let now_ns = pace.now_ns(now_ns, status.ticks);
-        let mut model = lock(self.model);
-        if let Some(figures) = &mut model.seen.device {
-            figures.status = Some(status);
-            figures.counters = device.counters();
-            figures.clock = Some(device.clock());
+    fn show_figures(&self, lines: &Lines, clock: &UtcClock, paces: &mut [Option<Pace>]) {
+        let mut earliest_ns: Option<i64> = None;
+        for (board, device) in lines.devices() {
+            // If it does not answer, the stream says so.
+            let Ok(status) = device.status() else { continue };
+            let now_ns = clock.at(Instant::now()).0;
+            let pace =
+                paces[board].get_or_insert_with(|| Pace::new(now_ns, status.ticks, device.hello().tick_hz));
+            let now_ns = pace.now_ns(now_ns, status.ticks);
+            earliest_ns = Some(earliest_ns.map_or(now_ns, |earliest_ns| earliest_ns.min(now_ns)));
+            if let Some(figures) = lock(self.model).seen.devices.get_mut(board) {
+                figures.status = Some(status);
+                figures.counters = device.counters();
+                figures.clock = Some(device.clock());
+            }
         }
-        // What is still on the way must not find its window closed.
-        model.advance(now_ns.saturating_sub(LATENESS_NS));
+        if let Some(now_ns) = earliest_ns {
+            // What is still on the way must not find its window closed.
+            lock(self.model).advance(now_ns.saturating_sub(LATENESS_NS));
+        }
     }
 
     /// The device is there: says whether it is the one from before, and takes over its bit rates.
-    fn greet(&self, device: &Device, plan: &Plan, back: &Return, reconnects: u32) {
-        let hello = device.hello();
+    fn greet(&self, board: usize, lines: &Lines, plan: &Plan, back: &Return, reconnects: u32) {
+        let Some((line, device)) = lines.lines().nth(board).and_then(|line| Some((line, line.device()?)))
+        else {
+            return;
+        };
+        let (hello, address) = (device.hello(), &plan.addresses[board]);
         let name = format!("{} {}", hello.board, hello.serial);
-        let opened = device.open_channels();
+        // All that are there: bit rates are set for all of them.
+        let opened: Vec<(u8, ChannelConfig, u32)> = lines
+            .devices()
+            .flat_map(|(board, device)| {
+                let clock_hz = device.hello().can_clock_hz;
+                let opened = device.open_channels().into_iter();
+                opened.map(move |(channel, config)| (channel_number(board, channel), config, clock_hz))
+            })
+            .collect();
         let mut model = lock(self.model);
         if let Some(other) = &back.other_board {
-            model.notice = format!("another board is at {} now: {other}", plan.address);
+            model.notice = format!("another board is at {address} now: {other}");
             if !back.only_listening.is_empty() {
                 model.notice.push_str(", and its channels only listen");
             }
         } else if let Some(after) = back.after {
-            model.notice = format!("{} is back after {:.1} s", plan.address, after.as_secs_f64());
+            model.notice = format!("{address} is back after {:.1} s", after.as_secs_f64());
         }
-        model.seen.device = Some(DeviceFigures {
+        if model.seen.devices.len() <= board {
+            model.seen.devices.resize_with(board + 1, DeviceFigures::default);
+        }
+        if model.sessions.len() <= board {
+            model.sessions.resize(board + 1, 0);
+        }
+        model.seen.devices[board] = DeviceFigures {
             queue_bytes: hello.queue_bytes,
             name,
-            reconnects,
+            reconnects: reconnects + line.gaps().count,
             ..DeviceFigures::default()
-        });
+        };
         model.source = SourceState::Running;
-        model.sessions += 1;
-        let rates = opened
-            .iter()
-            .map(|(channel, config)| (channel.number(), config.timing.bitrate_bps(hello.can_clock_hz)));
+        model.sessions[board] += 1;
+        let rates =
+            opened.iter().map(|(number, config, clock_hz)| (*number, config.timing.bitrate_bps(*clock_hz)));
         let rates: Vec<_> = rates.collect();
         let lacks =
-            |lacks: fn(&ChannelConfig) -> bool| opened.iter().filter(move |(_, config)| lacks(config));
-        let without_load: Vec<u8> = lacks(|config| config.omit_data || config.omit_stamps)
-            .map(|(channel, _)| channel.number())
-            .collect();
+            |lacks: fn(&ChannelConfig) -> bool| opened.iter().filter(move |(_, config, _)| lacks(config));
+        let without_load: Vec<u8> =
+            lacks(|config| config.omit_data || config.omit_stamps).map(|(number, ..)| *number).collect();
         if lacks(|config| config.omit_data).next().is_some() && model.notice.is_empty() {
             "the device leaves data out: zeros stand in its place, and the load is not known"
                 .clone_into(&mut model.notice);
@@ -170,22 +222,26 @@ impl Source<'_> {
     }
 
     /// An order, where there is a device to send with.
-    fn follow_with(&mut self, device: Option<&Device>, order: Order) -> Then {
-        let Some(device) = device else { return self.follow(order) };
+    fn follow_with(&mut self, lines: &Lines, order: Order) -> Then {
+        let (Order::Send(number, _) | Order::SetPeriodic(number, ..)) = order else {
+            return self.follow(order);
+        };
+        let (board, channel) = place_of(number);
+        let Some(device) = lines.lines().nth(board).and_then(Line::device) else { return self.follow(order) };
         match order {
-            Order::Send(channel, frame) => {
+            Order::Send(_, frame) => {
                 let frame = TxFrame { tag: 0, frame, at_ticks: None };
                 if let Err(error) = device.send(channel, &[frame]) {
                     self.notice(advice::told(&error));
                 }
                 Then::GoOn
             }
-            Order::SetPeriodic(channel, slot, entry) => {
+            Order::SetPeriodic(_, slot, entry) => {
                 let entry = entry.map(|(frame, period)| periodic(device.hello().tick_hz, frame, period));
                 if let Err(error) = device.set_periodic(channel, slot, entry) {
                     let mut model = lock(self.model);
                     model.notice = advice::told(&error);
-                    model.refused.push((channel, slot));
+                    model.refused.push((number, slot));
                 }
                 Then::GoOn
             }
@@ -195,10 +251,9 @@ impl Source<'_> {
 
     /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure
     /// spans it.
-    fn note_gap(&mut self, channels: &[Channel]) {
+    fn note_gap(&mut self, channels: &[u8]) {
         let time_ns = UtcClock::start().at(Instant::now()).0;
-        let gap =
-            |channel: &Channel| TraceRecord { time_ns, channel: channel.number(), event: TraceEvent::GAP };
+        let gap = |channel: &u8| TraceRecord { time_ns, channel: *channel, event: TraceEvent::GAP };
         let mut gap: Vec<_> = channels.iter().map(gap).collect();
         self.keep_up(&mut gap);
         self.take(&gap);
@@ -213,26 +268,35 @@ impl Source<'_> {
         }
     }
 
-    fn hand_over(&mut self, mut batch: Vec<TraceRecord>, line: &Line) {
+    fn hand_over(&mut self, mut batch: Vec<TraceRecord>, lines: &Lines) {
         if !batch.is_empty() {
             self.keep_up(&mut batch);
             self.take(&batch);
-            line.recycle(batch);
         }
+        let mut model = lock(self.model);
+        let now = Instant::now();
+        model.hearing.take(&batch, now);
+        for number in model.hearing.news(now) {
+            model.notice =
+                format!("channel {number}: only errors and no frame; is the bit rate right? A looks for it");
+        }
+        drop(model);
+        lines.recycle(batch);
     }
 }
 
-/// A device that is opened as the plan says.
-fn open_as(plan: &Plan) -> Line {
-    let Plan { address, channels, open } = plan.clone();
-    let mode = plan.mode();
-    line(&address, move |device| {
-        // No filters, not even saved ones: what is not shown is still recorded.
-        open.open(device, channels.iter().copied(), mode, None).map(|_| ())
+/// Devices that are opened as the plan says.
+fn open_as(plan: &Plan) -> Lines {
+    let for_setup = plan.clone();
+    lines(&plan.addresses, move |board, device| {
+        let open = for_setup.open.on_board(board);
+        // No filters, saved ones neither: what is not shown is recorded all the same.
+        open.open(device, for_setup.channels_of(board), for_setup.mode(), None).map(|_| ())
     })
 }
 
 /// How a device's time passes: with the computer's, or, where it does not run in real time (an emulated board), behind it.
+#[derive(Clone)]
 struct Pace {
     start_ns: i64,
     start_ticks: u64,

@@ -12,6 +12,8 @@ use std::sync::mpsc::Receiver;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
+use cantap::device::channel_number;
+use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
 use cantap::{Channel, Frame, TraceRecord};
 
@@ -29,29 +31,56 @@ pub fn lock(model: &Mutex<Model>) -> MutexGuard<'_, Model> {
     model.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Which device, and how to take part in its buses.
+/// Which devices, and how to take part in their buses.
 #[derive(Clone, Debug)]
 pub struct Plan {
-    /// The device.
-    pub address: Address,
-    /// Channels to open.
-    pub channels: Vec<Channel>,
+    /// The devices. The second one's channels are 3 and 4, and so on.
+    pub addresses: Vec<Address>,
+    /// Channels to open, by number.
+    pub channels: Vec<u8>,
     /// How to open them, as on the command line; only listening where it does not say.
     pub open: ChannelArgs,
 }
 
 impl Plan {
-    /// Only listening to a device, on the channels whose bit rates are known; on both if none is.
-    pub fn listening(address: Address, options: &cantap_analysis::stats::Options) -> Self {
-        let mut open = ChannelArgs::default();
-        for channel in Channel::ALL.map(Channel::number) {
+    /// Only listening to devices, on the channels whose bit rates are known; on all if none is.
+    pub fn listening(addresses: Vec<Address>, options: &cantap_analysis::stats::Options) -> Self {
+        let mut plan = Self { addresses, channels: Vec::new(), open: ChannelArgs::default() };
+        for channel in plan.all_channels() {
             let rate = options.bitrate_of(channel);
             let rates = rate.map(|bitrate_bps| ChannelBitrate { channel: Some(channel), bitrate_bps });
-            open.timing.bitrates.extend(rates);
+            plan.open.timing.bitrates.extend(rates);
         }
-        let mut plan = Self { address, channels: Vec::new(), open };
         plan.choose_channels();
         plan
+    }
+
+    /// The same with other devices. With more or fewer of them, it has other channels, too.
+    pub fn at(&self, addresses: Vec<Address>) -> Self {
+        let is_as_many = addresses.len() == self.addresses.len();
+        let mut plan = Self { addresses, ..self.clone() };
+        if !is_as_many {
+            plan.choose_channels();
+        }
+        plan
+    }
+
+    /// What messages call the devices.
+    pub fn name(&self) -> String {
+        let names: Vec<String> = self.addresses.iter().map(ToString::to_string).collect();
+        names.join(" + ")
+    }
+
+    /// The channels of a device, from 0, that are to be opened.
+    pub fn channels_of(&self, board: usize) -> impl Iterator<Item = Channel> + use<'_> {
+        Channel::ALL
+            .into_iter()
+            .filter(move |channel| self.channels.contains(&channel_number(board, *channel)))
+    }
+
+    /// The numbers of all channels that the devices have.
+    fn all_channels(&self) -> std::ops::RangeInclusive<u8> {
+        1..=(self.addresses.len() * CHANNELS) as u8
     }
 
     /// How it takes part in the buses.
@@ -65,19 +94,18 @@ impl Plan {
         self.choose_channels();
     }
 
-    /// The channels that bit rates speak of; both if there are none.
+    /// The channels that bit rates speak of; all if there are none.
     pub fn choose_channels(&mut self) {
         let rates = &self.open.timing.bitrates;
-        self.channels = Channel::ALL
-            .into_iter()
-            .filter(|channel| rates.is_empty() || ChannelBitrate::of(rates, channel.number()).is_some())
+        self.channels = self
+            .all_channels()
+            .filter(|channel| rates.is_empty() || ChannelBitrate::of(rates, *channel).is_some())
             .collect();
     }
 
     /// The statistics' options with this plan's bit rates, as far as it has any.
     pub fn options(&self, others: &cantap_analysis::stats::Options) -> cantap_analysis::stats::Options {
-        let rates = self.channels.iter().filter_map(|channel| {
-            let number = channel.number();
+        let rates = self.channels.iter().copied().filter_map(|number| {
             let own = ChannelBitrate::of(&self.open.timing.bitrates, number);
             Some((number, own.or_else(|| others.bitrate_of(number))?))
         });
@@ -105,10 +133,10 @@ pub enum Order {
     Record(PathBuf),
     /// End the recording.
     StopRecording,
-    /// Send a frame once.
-    Send(Channel, Frame),
+    /// Send a frame once, on the channel with this number.
+    Send(u8, Frame),
     /// Let the device send a frame periodically; `None` ends it.
-    SetPeriodic(Channel, u8, Option<(Frame, Duration)>),
+    SetPeriodic(u8, u8, Option<(Frame, Duration)>),
     /// Playback: faster.
     Faster,
     /// Playback: slower.

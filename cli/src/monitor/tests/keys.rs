@@ -1,7 +1,7 @@
 //! What keys do.
 
+use cantap::TraceRecord;
 use cantap::wire::message::Mode;
-use cantap::{Channel, TraceRecord};
 use cantap_analysis::stats::Options;
 use cantap_signals::Decoder;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
@@ -95,14 +95,14 @@ fn nothing_is_sent_while_listening_only_and_the_way_out_is_shown() {
     press(&mut app, &mut model, "a123#11 100ms\n\n ");
     assert_eq!(app.message, "listen-only: nothing is sent; press m to take part in the bus");
     assert!(orders.try_recv().is_err());
-    press(&mut app, &mut model, "m");
+    press(&mut app, &mut model, "my\n");
     assert!(matches!(orders.try_recv().unwrap(), Order::Open(plan) if plan.mode() == Mode::Normal));
     press(&mut app, &mut model, "\n");
-    assert!(matches!(orders.try_recv().unwrap(), Order::Send(Channel::Can1, _)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::Send(1, _)));
     press(&mut app, &mut model, " ");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, Some(_))));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, Some(_))));
     press(&mut app, &mut model, "d");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, None)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, None)));
     assert!(app.send.is_empty());
 }
 
@@ -240,27 +240,27 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
 fn an_entry_that_is_edited_while_it_is_sent_changes_on_the_bus() {
     let mut model = model();
     let (mut app, orders) = app(View::Send);
-    press(&mut app, &mut model, "ma123#11 100ms\n ");
+    press(&mut app, &mut model, "my\na123#11 100ms\n ");
     assert!(matches!(orders.try_recv().unwrap(), Order::Open(_)));
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, Some(_))));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, Some(_))));
     // To the other channel: it must end on the first.
     press(&mut app, &mut model, "e");
     app.key(KeyEvent::from(KeyCode::Home), &mut model);
     press(&mut app, &mut model, "2:\n");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can1, 0, None)));
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 0, Some(_))));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(1, 0, None)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(2, 0, Some(_))));
     assert_eq!(app.send[0].text, "2:123#11 100ms");
     // Each has a slot of its own, and keeps it when others go.
     press(&mut app, &mut model, "a2:124#22 50ms\n");
     app.key(KeyEvent::from(KeyCode::Down), &mut model);
     press(&mut app, &mut model, " ");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 1, Some(_))));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(2, 1, Some(_))));
     app.key(KeyEvent::from(KeyCode::Up), &mut model);
     press(&mut app, &mut model, "d");
-    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(Channel::Can2, 0, None)));
+    assert!(matches!(orders.try_recv().unwrap(), Order::SetPeriodic(2, 0, None)));
     assert_eq!((app.send.len(), app.send[0].slot), (1, Some(1)));
     // The device has no such slot.
-    model.refused.push((Channel::Can2, 1));
+    model.refused.push((2, 1));
     app.catch_up(&mut model);
     assert_eq!(app.send[0].slot, None);
     assert!(orders.try_recv().is_err());
@@ -278,4 +278,35 @@ fn a_letter_with_control_is_not_that_letter() {
     assert!(app.prompt.is_none() && orders.try_recv().is_err());
     let z = KeyEvent::new(KeyCode::Char('z'), KeyModifiers::CONTROL);
     assert_eq!(app.key(z, &mut model), Flow::Suspend);
+}
+
+#[test]
+fn nothing_takes_part_in_a_bus_that_was_not_asked_for_just_now() {
+    let mut model = model();
+    let (mut app, orders) = app(View::Fixed);
+    let modes = || -> Vec<Mode> {
+        let plan = |order| match order {
+            Order::Open(plan) => plan.mode(),
+            other => panic!("{other:?}"),
+        };
+        orders.try_iter().map(plan).collect()
+    };
+    // Asked, and anything but a yes is a no.
+    for no in ["mn\n", "m\n", "mm\n"] {
+        press(&mut app, &mut model, no);
+        assert_eq!((modes(), app.message.as_str()), (Vec::new(), "it stays listen-only"), "{no}");
+    }
+    press(&mut app, &mut model, "my\n");
+    assert_eq!(modes(), [Mode::Normal]);
+    // Other bit rates, another device: it only listens, and says so.
+    for other in ["b", "D"] {
+        press(&mut app, &mut model, &format!("{other}\n"));
+        assert_eq!(modes(), [Mode::ListenOnly], "{other}");
+        assert!(app.message.starts_with("listen-only now"), "{}", app.message);
+        press(&mut app, &mut model, "my\n");
+        assert_eq!(modes(), [Mode::Normal]);
+    }
+    // Leaving the bus needs no question.
+    press(&mut app, &mut model, "m");
+    assert_eq!(modes(), [Mode::ListenOnly]);
 }

@@ -115,7 +115,7 @@ fn app(view: View) -> (App, Receiver<Order>) {
     let (sender, receiver) = orders();
     let theme = Theme { colour: true, light: false, unicode: true };
     let options = Options { channel_bitrate_bps: vec![(1, 250_000)], ..Options::default() };
-    let plan = Plan::listening(Address::of_virtual_device(), &options);
+    let plan = Plan::listening(vec![Address::of_virtual_device()], &options);
     (App::new(view, theme, Some(plan), sender), receiver)
 }
 
@@ -152,7 +152,7 @@ fn check_page(view: View) {
         assert_eq!(app.send.len(), 2, "{}", app.message);
     }
     if view == View::Statistics {
-        model.seen.device = Some(device());
+        model.seen.devices = vec![device()];
     }
     if view == View::Record {
         model.recording = Some(Recording {

@@ -1,8 +1,8 @@
 //! Any keys, clicks, sizes and events, in any order: nothing makes the display panic.
 
+use cantap::TraceEvent;
 use cantap::TraceRecord;
 use cantap::wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
-use cantap::{Channel, TraceEvent};
 use ratatui::Terminal;
 use ratatui::backend::TestBackend;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
@@ -106,9 +106,9 @@ fn happen(random: &mut fastrand::Rng, model: &mut Model, now_ns: &mut i64) {
             model.source = SourceState::Playing { factor: 0.5, paused, looped, ended };
         }
         3 => model.interrupt(),
-        4 => model.sessions += 1,
-        5 => model.refused.push((Channel::Can1, random.u8(..))),
-        6 => model.seen.device = random.bool().then(device),
+        4 => model.sessions = vec![u32::from(random.u8(..))],
+        5 => model.refused.push((1, random.u8(..))),
+        6 => model.seen.devices = random.bool().then(device).into_iter().collect(),
         7 => model.notice = "word ".repeat(random.usize(..200)),
         8 => {
             let path = "x".repeat(random.usize(..300));
@@ -189,7 +189,7 @@ fn nothing_that_anybody_does_makes_the_display_panic() {
                 Order::Open(plan) => {
                     let options = plan.options(model.options());
                     model.set_options(options).unwrap();
-                    model.sessions += 1;
+                    model.sessions = vec![u32::from(random.u8(..))];
                 }
                 Order::SetPeriodic(channel, slot, Some(_)) if slot > 3 => model.refused.push((channel, slot)),
                 _ => {}

@@ -98,7 +98,10 @@ fn question(kind: PromptKind) -> &'static str {
         }
         PromptKind::Send => "[CHANNEL:]FRAME or Message:Signal=value,…, then a period if it is periodic",
         PromptKind::BitRate => "bit rates: 500k, or one for each channel: 1:500k 2:250k",
-        PromptKind::Device => "device: a serial port, virtual, or emu:FIRMWARE.elf",
+        PromptKind::Device => {
+            "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them"
+        }
+        PromptKind::Normal => "acknowledge other nodes' frames, and send on request, on this bus? y or n",
     }
 }
 

@@ -38,7 +38,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
             format!(
                 "{} {} {:<24} {period:>10} {:>8}  {}",
                 if entry.slot.is_some() { "on" } else { "  " },
-                entry.channel.number(),
+                entry.channel,
                 entry.frame.to_string(),
                 entry.sent,
                 entry.text

@@ -1,5 +1,7 @@
 //! The second line: source, load per channel, losses, recording, what hides something.
 
+use std::time::Instant;
+
 use cantap::wire::message::Mode;
 use ratatui::text::{Line, Span};
 
@@ -21,13 +23,21 @@ pub fn line(app: &App, model: &Model) -> Line<'static> {
             Mode::Loopback => "loopback",
             Mode::SilentLoopback => "silent loopback",
         };
-        format!("{} {mode}", end_of(&plan.address.to_string()))
+        format!("{} {mode}", end_of(&plan.name()))
     });
     let style = match model.source {
         SourceState::Gone(_) => theme.error(),
         _ => theme.label(),
     };
     let mut spans = vec![Span::styled(format!(" {source}: {}", source_text(app, model)), style)];
+    let deaf: Vec<String> =
+        model.hearing.errors_only(Instant::now()).map(|number| number.to_string()).collect();
+    if !deaf.is_empty() {
+        spans.push(Span::styled(
+            format!("  {}: ONLY ERRORS, A finds the bit rate", deaf.join(", ")),
+            theme.error(),
+        ));
+    }
     if let Some((count, _)) = &model.unread {
         spans.push(Span::styled(format!("  {count} unreadable"), theme.error()));
     }

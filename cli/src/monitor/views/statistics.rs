@@ -1,6 +1,7 @@
 //! Load with its history, rates, errors, losses per stage, and how the device is.
 
-use cantap::device::ClockSource;
+use cantap::Channel;
+use cantap::device::{ClockSource, channel_number};
 use cantap::wire::record::{BusErrorKind, LossStage};
 use cantap_analysis::stats::ChannelStatistics;
 use ratatui::Frame;
@@ -40,8 +41,8 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         lines.push(Line::from("Nothing was received yet."));
         lines.push(Line::default());
     }
-    if let Some(device) = &seen.device {
-        device_lines(device, &mut lines);
+    for (board, device) in seen.devices.iter().enumerate() {
+        device_lines(board, device, &mut lines);
     }
     let (used, most) = model.history.memory();
     lines.push(Line::from(format!(
@@ -150,7 +151,7 @@ fn gauge(load: f64, columns: usize, channel: &ChannelStatistics, app: &App) -> L
     ])
 }
 
-fn device_lines(device: &DeviceFigures, lines: &mut Vec<Line<'static>>) {
+fn device_lines(board: usize, device: &DeviceFigures, lines: &mut Vec<Line<'static>>) {
     lines.push(Line::from(format!("Device {}", device.name)).style(Theme::heading()));
     let delivered: u64 = device.counters.channels.iter().map(|channel| channel.received).sum();
     if let Some(status) = &device.status {
@@ -161,7 +162,8 @@ fn device_lines(device: &DeviceFigures, lines: &mut Vec<Line<'static>>) {
             device.queue_bytes / 1024,
             share(status.queue_high_water_bytes)
         )));
-        for (number, channel) in (1..).zip(&status.channels) {
+        for (place, channel) in Channel::ALL.into_iter().zip(&status.channels) {
+            let number = channel_number(board, place);
             if channel.open.is_some() {
                 lines.push(Line::from(format!(
                     "Bus {number}     {}, counters {} / {}, sent {}, failed {}, waiting {}",

@@ -38,6 +38,7 @@ pub struct ChannelSummary {
     /// The channel, from 1.
     pub channel: u8,
     /// Its bit rate in bit/s, if it was given.
+    #[serde(rename = "bitrate_bps")]
     pub bitrate: Option<u32>,
     /// The bit rate of its data phases in bit/s, if it was given.
     pub data_bitrate: Option<u32>,

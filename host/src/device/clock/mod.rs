@@ -14,12 +14,14 @@
 
 mod common;
 mod corridor;
+mod follower;
 mod frames;
 mod units;
 
 use std::collections::VecDeque;
 
 pub use common::{CommonClock, NotCommon};
+pub use follower::{Follower, FollowerReport};
 pub use frames::{FrameClock, FrameDoubt, SofMark};
 pub use units::{FrameNs, Ticks, UtcClock, UtcNs};
 

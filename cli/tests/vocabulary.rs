@@ -1,0 +1,138 @@
+//! What is called the same everywhere: channels, JSON keys, mistakes and their exit codes.
+
+use std::process::{Command, Output, Stdio};
+
+fn cantap(arguments: &str) -> (Option<i32>, String, String) {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    command.args(arguments.split_whitespace()).stdin(Stdio::null());
+    let Output { status, stdout, stderr } = command.output().unwrap();
+    (status.code(), String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+}
+
+fn json(arguments: &str) -> serde_json::Value {
+    let (code, out, err) = cantap(&format!("{arguments} --json"));
+    assert_eq!(code, Some(0), "{arguments}: {err}");
+    assert_eq!(out.lines().count(), 1, "{arguments}: {out}");
+    serde_json::from_str(&out).unwrap()
+}
+
+/// Each key with every value that it has anywhere in an object.
+fn each(value: &serde_json::Value, see: &mut impl FnMut(&str, &serde_json::Value)) {
+    match value {
+        serde_json::Value::Object(members) => {
+            for (key, value) in members {
+                see(key, value);
+                each(value, see);
+            }
+        }
+        serde_json::Value::Array(values) => values.iter().for_each(|value| each(value, see)),
+        _ => {}
+    }
+}
+
+const TRACE: &str = "../host/formats/tests/data/nmea2000.log.gz";
+
+/// As `docs/json.md` has it.
+#[test]
+fn json_speaks_one_language_in_every_command() {
+    for arguments in [
+        "info -d virtual".to_owned(),
+        "status -d virtual".to_owned(),
+        "list".to_owned(),
+        "bits 123#11".to_owned(),
+        "timing -b 500k".to_owned(),
+        "autobaud -d virtual".to_owned(),
+        "defaults show -d virtual".to_owned(),
+        "capture -d virtual -b 500k -t 200ms".to_owned(),
+        "send -d virtual 1 123#11".to_owned(),
+        format!("stats {TRACE} -b 250k --windows"),
+        format!("diff {TRACE} {TRACE}"),
+    ] {
+        each(&json(&arguments), &mut |key, value| {
+            let abbreviated = ["ch", "t", "bitrate"].contains(&key);
+            let spelt_out = key.ends_with("_percent") || key.ends_with("_seconds");
+            assert!(!abbreviated && !spelt_out, "{arguments}: {key}");
+            let is_number = value.is_number() || value.is_null();
+            match key {
+                "channel" => {
+                    assert!(value.as_u64().is_some_and(|channel| channel >= 1), "{arguments}: {value}");
+                }
+                "seconds" | "bitrate_bps" => assert!(is_number, "{arguments}: {key} {value}"),
+                _ if ["_s", "_us", "_ms", "_pct", "_ppm", "_hz", "_bps"]
+                    .iter()
+                    .any(|unit| key.ends_with(unit)) =>
+                {
+                    assert!(is_number, "{arguments}: {key} {value}");
+                }
+                _ => {}
+            }
+        });
+    }
+}
+
+#[test]
+fn send_tells_scripts_what_became_of_the_frames() {
+    let sent = json("send -d virtual 2 123#11 124#22 -n 3");
+    assert_eq!((&sent["channel"], &sent["asked"], &sent["sent"]), (&2.into(), &6.into(), &6.into()));
+    assert!(sent["reason"].is_null() && sent["seconds"].is_f64(), "{sent}");
+    let (code, out, _) = cantap("send -d virtual:ack=no 1 123#11 --json");
+    let failed: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!((code, &failed["not_sent"]), (Some(1), &1.into()), "{failed}");
+    assert!(failed["reason"].as_str().unwrap().contains("nobody acknowledged"), "{failed}");
+}
+
+/// Channel 1 is 1 in words, and `can0` where a trace wants an interface; both are understood.
+#[test]
+fn a_channel_has_one_number_in_every_command() {
+    for (arguments, part) in [
+        ("stats -d virtual -b 500k -c can1 -t 1200ms", "channel 2 "),
+        ("capture -d virtual -b 500k -c can1 -n 5 -o /dev/null --format candump", "channel 2: 5 frames"),
+        ("autobaud -d virtual -c can1", "bit/s"),
+        ("monitor -d virtual -b 500k -c can1 --once --view statistics -t 1s", "Channel 2: 500000 bit/s"),
+    ] {
+        let (code, out, err) = cantap(arguments);
+        assert!(code == Some(0) && (out + &err).contains(part), "{arguments}: {err}");
+    }
+    let (_, out, _) = cantap("send -d virtual 2 123#11");
+    assert!(out.contains(" can1 123#11 T"), "{out}");
+    let (_, out, _) = cantap("send -d virtual can1 123#11");
+    assert!(out.contains(" can1 123#11 T"), "{out}");
+}
+
+#[test]
+fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
+    let folder = tempfile::tempdir().unwrap();
+    let there = folder.path().join("there.log");
+    std::fs::write(&there, "kept").unwrap();
+    let there = there.display();
+    for (arguments, part) in [
+        ("capture -d virtual -b 500".to_owned(), "write 500k for 500 kbit/s"),
+        ("monitor -d virtual -b 500 --once".to_owned(), "write 500k for 500 kbit/s"),
+        ("stats -d virtual -b 500".to_owned(), "write 500k for 500 kbit/s"),
+        (
+            "capture -d virtual -b 500k -o x.foo".to_owned(),
+            "the name 'x.foo' does not tell the format; name it with",
+        ),
+        (format!("convert {TRACE} x.foo"), "the name 'x.foo' does not tell the format"),
+        ("send -d virtual 123#11".to_owned(), "as in: cantap send 1 123#11"),
+        ("capture -d virtual -b 500k -f 12x".to_owned(), "neither an ID, such as 123"),
+        ("capture -d virtual -b 500k -c 3".to_owned(), "a device has channels 1 and 2, and no channel 3"),
+        ("stats -d virtual -b 500k -c 3".to_owned(), "a device has channels 1 and 2, and no channel 3"),
+        ("status -d virtual -t 1s -c 3".to_owned(), "a device has channels 1 and 2, and no channel 3"),
+    ] {
+        let (code, _, err) = cantap(&arguments);
+        assert_eq!(code, Some(2), "{arguments}: {err}");
+        assert!(err.contains(part), "{arguments}: {err}");
+    }
+    // What is there is not lost by a slip.
+    let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there}"));
+    assert!(code == Some(1) && err.contains("there already"), "{err}");
+    assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
+    let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there} --force"));
+    assert_eq!(code, Some(0), "{err}");
+    // What candump's users type.
+    let (code, out, err) = cantap("capture -d virtual:frames=std8 -b 500k -f 123 -t 300ms");
+    assert!(code == Some(0) && out.lines().all(|line| line.contains(" 123#")), "{err}{out}");
+    let (code, out, err) = cantap(&format!("search {TRACE} --id 9F80102 --count"));
+    assert!(code == Some(0) && out.trim() != "0", "{err}{out}");
+}

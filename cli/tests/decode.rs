@@ -62,9 +62,9 @@ fn json_lines_have_exactly_the_documented_keys() {
     assert_eq!(code, Some(0));
     assert_eq!(
         out,
-        "{\"t\":1.000000,\"ch\":1,\"id\":\"618\",\"message\":\"Dashboard\",\"signals\":{\"Speed\":88,\"EngineSpeed\":5119.5,\"Ignition\":0}}\n\
-         {\"t\":1.500000,\"ch\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":1,\"F\":-2.000030517578125}}\n\
-         {\"t\":3.000000,\"ch\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":0,\"F\":null}}\n"
+        "{\"time_s\":1.000000,\"channel\":1,\"id\":\"618\",\"message\":\"Dashboard\",\"signals\":{\"Speed\":88,\"EngineSpeed\":5119.5,\"Ignition\":0}}\n\
+         {\"time_s\":1.500000,\"channel\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":1,\"F\":-2.000030517578125}}\n\
+         {\"time_s\":3.000000,\"channel\":2,\"id\":\"618\",\"message\":\"Body\",\"signals\":{\"Door\":0,\"F\":null}}\n"
     );
 }
 

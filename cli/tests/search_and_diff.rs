@@ -58,7 +58,7 @@ fn frames_are_found_by_identifier_data_and_condition() {
         let found: Vec<_> = out
             .lines()
             .map(|line| {
-                serde_json::from_str::<serde_json::Value>(line).unwrap()["t"].as_f64().unwrap() as usize
+                serde_json::from_str::<serde_json::Value>(line).unwrap()["time_s"].as_f64().unwrap() as usize
             })
             .collect();
         assert_eq!((code, &found[..], err.as_str()), (Some(0), expected, ""), "{arguments:?}");

@@ -32,7 +32,7 @@ use crate::live::LiveArgs;
     candump -L can0 | cantap decode --db car.dbc - --json\n  \
     cantap decode --db car.dbc trace.log --csv --resample 100ms > drive.csv\n  \
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
-JSON lines are {\"t\", \"ch\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
+JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
     identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
 With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.")]
 pub struct Args {

@@ -198,7 +198,7 @@ impl Sink {
             }
             Kind::Json(out) => {
                 let mut object = serde_json::json!({
-                    "t": record.time_ns as f64 / 1e9, "ch": record.channel, "match": found,
+                    "time_s": record.time_ns as f64 / 1e9, "channel": record.channel, "match": found,
                 });
                 match record.frame() {
                     Some(frame) => {

@@ -8,7 +8,13 @@ use super::decoded::{Decoded, Reading, Seconds};
 pub fn write(out: &mut impl Write, decoded: &Decoded, details: bool) -> io::Result<()> {
     let Decoded { record, frame, message, values, .. } = decoded;
     // Written by hand: numbers keep every digit, and it is several times faster than a tree of values.
-    write!(out, "{{\"time_s\":{},\"channel\":{},\"id\":\"{}\",", Seconds(record.time_ns), record.channel, frame.id())?;
+    write!(
+        out,
+        "{{\"time_s\":{},\"channel\":{},\"id\":\"{}\",",
+        Seconds(record.time_ns),
+        record.channel,
+        frame.id()
+    )?;
     out.write_all(b"\"message\":")?;
     serde_json::to_writer(&mut *out, &message.name)?;
     out.write_all(b",\"signals\":{")?;

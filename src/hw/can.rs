@@ -88,6 +88,7 @@ impl Deref for Registers {
 /// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it interrupt.
 pub struct Bells<const CAN: usize>(());
 
+#[expect(clippy::unused_self, reason = "only whoever holds the bells may ring them")]
 impl<const CAN: usize> Bells<CAN> {
     #[inline]
     fn registers() -> &'static RegisterBlock {

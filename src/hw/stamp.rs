@@ -39,6 +39,7 @@ impl StampTimer {
 
     /// The registers: for [`StampAlarm`], and for the latch, whose channel is another.
     #[inline]
+    #[expect(clippy::unused_self, reason = "a timer proves that it was started")]
     pub(super) fn registers(self) -> &'static RegisterBlock {
         // SAFETY: the registers are there for the whole program. `start` took the peripheral and makes the only alarm, so that
         // the alarm's registers are written by its owner alone; the latch writes those of channel 4, at start.

@@ -84,7 +84,7 @@ impl Matcher<'_> {
             return self.is_in(&event_text(&record.event), false);
         };
         self.is_in(frame, true)
-            || model.seen.signals.name_of(record).is_some_and(|name| self.is_in(&name, false))
+            || model.seen.signals.name_of(&record).is_some_and(|name| self.is_in(&name, false))
     }
 
     fn is_in(&mut self, what: &dyn Display, compact: bool) -> bool {

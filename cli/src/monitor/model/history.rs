@@ -2,15 +2,23 @@
 
 use std::collections::VecDeque;
 
-use cantap::TraceRecord;
+use cantap::{TraceEvent, TraceRecord};
 use cantap_trace::filter::Filter;
+
+use super::kept::Kept;
+
+/// Records that are kept however little memory there is.
+const LEAST: usize = 1000;
 
 /// The past: every record, and a list of those that the filters accept.
 ///
 /// A place in the list counts from the first record ever listed, and stays what it is while older ones make room.
 pub struct History {
-    records: VecDeque<TraceRecord>,
+    records: VecDeque<Kept>,
     most: usize,
+    /// The CAN FD frames among the records, and the number of the first: numbers count on, and wrap.
+    fd: VecDeque<TraceEvent>,
+    first_fd: u32,
     /// Number of the oldest record, from the first one ever.
     first: u64,
     filters: Vec<Filter>,
@@ -23,16 +31,31 @@ pub struct History {
 impl History {
     /// Room for as many records as `bytes` hold, at least a thousand.
     pub fn new(bytes: usize) -> Self {
-        let most = (bytes / size_of::<TraceRecord>()).max(1000);
+        let most = (bytes / size_of::<Kept>()).max(LEAST);
         // Reserved at once: growing would copy everything, and the display would freeze meanwhile.
         let records = VecDeque::with_capacity(most);
-        Self { records, most, first: 0, filters: Vec::new(), listed: VecDeque::new(), first_listed: 0 }
+        let fd = VecDeque::new();
+        Self {
+            records,
+            most,
+            fd,
+            first_fd: 0,
+            first: 0,
+            filters: Vec::new(),
+            listed: VecDeque::new(),
+            first_listed: 0,
+        }
     }
 
     /// Appends a record; the oldest makes room.
     pub fn push(&mut self, record: TraceRecord) {
-        if self.records.len() == self.most {
-            self.records.pop_front();
+        while self.records.len() == self.most
+            || self.records.len() >= LEAST && self.kept_bytes() > self.memory().1
+        {
+            if self.records.pop_front().is_some_and(|record| record.is_fd()) {
+                self.fd.pop_front();
+                self.first_fd = self.first_fd.wrapping_add(1);
+            }
             if self.listed.front() == Some(&self.first) {
                 self.listed.pop_front();
                 self.first_listed += 1;
@@ -42,7 +65,11 @@ impl History {
         if !self.filters.is_empty() && self.accepts(&record) {
             self.listed.push_back(self.first + self.records.len() as u64);
         }
-        self.records.push_back(record);
+        let kept = Kept::new(&record, self.first_fd.wrapping_add(self.fd.len() as u32));
+        if kept.is_fd() {
+            self.fd.push_back(record.event);
+        }
+        self.records.push_back(kept);
     }
 
     /// The filters.
@@ -62,7 +89,9 @@ impl History {
         self.filters = filters;
         let accepted = (self.first..)
             .zip(&self.records)
-            .filter(|(_, record)| !self.filters.is_empty() && self.accepts(record))
+            .filter(|(_, record)| {
+                !self.filters.is_empty() && self.whole(record).is_some_and(|record| self.accepts(&record))
+            })
             .map(|(number, _)| number);
         self.listed = accepted.collect();
         self.first_listed = 0;
@@ -99,11 +128,13 @@ impl History {
     }
 
     /// The record listed at a place, if it is still there.
-    pub fn get(&self, place: u64) -> Option<&TraceRecord> {
+    pub fn get(&self, place: u64) -> Option<TraceRecord> {
         if place < self.first() || place >= self.end() {
             return None;
         }
-        self.records.get(usize::try_from(self.number(place) - self.first).ok()?)
+        self.records
+            .get(usize::try_from(self.number(place) - self.first).ok()?)
+            .and_then(|kept| self.whole(kept))
     }
 
     /// Records there are, listed or not.
@@ -113,8 +144,15 @@ impl History {
 
     /// Bytes in use, the list's included, and bytes there may be of records.
     pub fn memory(&self) -> (usize, usize) {
-        let used = self.records.len() * size_of::<TraceRecord>() + self.listed.len() * size_of::<u64>();
-        (used, self.most * size_of::<TraceRecord>())
+        (self.kept_bytes() + self.listed.len() * size_of::<u64>(), self.most * size_of::<Kept>())
+    }
+
+    fn whole(&self, kept: &Kept) -> Option<TraceRecord> {
+        kept.record(|number| self.fd.get(number.wrapping_sub(self.first_fd) as usize).copied())
+    }
+
+    fn kept_bytes(&self) -> usize {
+        self.records.len() * size_of::<Kept>() + self.fd.len() * size_of::<TraceEvent>()
     }
 
     /// Forgets everything but the filters; numbers and places go on.
@@ -122,6 +160,8 @@ impl History {
         self.first += self.records.len() as u64;
         self.first_listed += self.listed.len() as u64;
         self.records.clear();
+        self.first_fd = self.first_fd.wrapping_add(self.fd.len() as u32);
+        self.fd.clear();
         self.listed.clear();
     }
 }
@@ -129,7 +169,7 @@ impl History {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use cantap::{Direction, TraceEvent};
+    use cantap::Direction;
 
     #[test]
     fn the_oldest_makes_room_and_numbers_stay() {
@@ -154,6 +194,22 @@ mod tests {
         let frame = if n % 3 == 0 { "123#" } else { "124#" }.parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
         TraceRecord { time_ns: n, channel: 1, event }
+    }
+
+    #[test]
+    fn fd_frames_make_room_by_their_size() {
+        let mut history = History::new(32 * 4000);
+        let event = |at: i64| {
+            let frame = format!("123##1{}", "00".repeat(64)).parse().unwrap();
+            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            TraceRecord { time_ns: at, channel: 1, event }
+        };
+        (0..4000).for_each(|n| history.push(event(n)));
+        let (used, most) = history.memory();
+        assert!(used <= most + 200 || history.len() == 1000, "{used} of {most}, {} records", history.len());
+        assert_eq!(history.get(history.end() - 1), Some(event(3999)));
+        (4000..12_000).for_each(|n| history.push(frame(n)));
+        assert_eq!(history.len(), 4000);
     }
 
     fn listed(history: &History) -> Vec<i64> {

@@ -3,6 +3,7 @@
 
 pub mod fixed;
 pub mod history;
+mod kept;
 pub mod signals;
 
 use std::collections::VecDeque;

@@ -19,7 +19,7 @@ fn pausing_stops_the_display_but_not_the_model() {
         press(&mut app, &mut model, " ");
         let rows = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
         let before = rows(screen_text(&mut app, &model, (110, 30)).unwrap());
-        let last = *model.history.get(model.history.end() - 1).unwrap();
+        let last = model.history.get(model.history.end() - 1).unwrap();
         let taken = model.seen.taken;
         model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000, ..last }; 3]);
         assert_eq!(model.seen.taken, taken + 3);
@@ -178,7 +178,7 @@ fn a_filter_hides_what_was_seen_before_too_and_gives_it_back() {
     let listed = model.history.end() - model.history.first();
     assert!((300..1000).contains(&listed), "{listed}");
     // What comes is filtered alike, and statistics and recording take everything.
-    let last = *model.history.get(model.history.end() - 1).unwrap();
+    let last = model.history.get(model.history.end() - 1).unwrap();
     let other = TraceRecord { event: super::frame("123#11"), ..last };
     model.take(&[last, other]);
     assert_eq!(model.history.end() - model.history.first(), listed + 1);
@@ -195,9 +195,9 @@ fn the_selected_record_stays_selected_when_the_filter_changes() {
     let mut model = model();
     let (mut app, _orders) = app(View::Trace);
     press(&mut app, &mut model, "/09F80202\n");
-    let selected = *model.history.get(app.cursor.unwrap()).unwrap();
+    let selected = model.history.get(app.cursor.unwrap()).unwrap();
     press(&mut app, &mut model, "f09F80202:1FFFFFFF\n");
-    assert_eq!(*model.history.get(app.cursor.unwrap()).unwrap(), selected);
+    assert_eq!(model.history.get(app.cursor.unwrap()).unwrap(), selected);
     // Nothing passes: nothing is selected, and no key minds.
     press(&mut app, &mut model, "f,7FF:7FF\n");
     screen_text(&mut app, &model, (80, 24)).unwrap();
@@ -214,7 +214,7 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
         press(&mut app, &mut model, " ");
         let page = |text: String| text.lines().skip(2).map(str::to_owned).collect::<Vec<_>>();
         let before = page(screen_text(&mut app, &model, (110, 30)).unwrap());
-        let last = *model.history.get(model.history.end() - 1).unwrap();
+        let last = model.history.get(model.history.end() - 1).unwrap();
         let moved = TraceRecord { event: super::frame("09F80202#01FC6C000001FFFF"), ..last };
         model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000_000, ..moved }; 30]);
         let after = page(screen_text(&mut app, &model, (110, 30)).unwrap());

@@ -54,7 +54,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             continue;
         };
         let before = number.checked_sub(1).and_then(|number| history.get(number));
-        let line = line(record, before, app, model);
+        let line = line(&record, before.as_ref(), app, model);
         lines.push(if app.cursor == Some(number) { line.style(Theme::bar()) } else { line });
     }
     frame.render_widget(Paragraph::new(lines), area);
@@ -125,5 +125,5 @@ fn event_style(event: &TraceEvent, theme: Theme) -> Style {
 pub fn candump_line(model: &Model, number: u64) -> Option<String> {
     let record = model.history.get(number)?;
     let frame = record.frame()?;
-    Some(format!("({}) can{} {frame}", seconds(record.time_ns), record.channel.saturating_sub(1)))
+    Some(format!("({}) {} {frame}", seconds(record.time_ns), cantap_trace::Interface(record.channel)))
 }

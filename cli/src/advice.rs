@@ -80,9 +80,10 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
-/// Whether a file's name or `--format` names no format, for reading or for writing.
-pub fn is_unknown_format(error: &(dyn Error + 'static)) -> bool {
-    unknown_format(error).is_some()
+/// Whether an output's name or `--format` names no format. What is read is recognised by its content, so a name that says nothing is no mistake.
+pub fn is_unknown_format(error: &anyhow::Error) -> bool {
+    error.chain().all(|cause| !cause.is::<OpenError>())
+        && error.chain().any(|cause| unknown_format(cause).is_some())
 }
 
 /// The option that names the format: of what is read, or of what is written.
@@ -91,8 +92,8 @@ fn option(error: &(dyn Error + 'static)) -> &'static str {
 }
 
 fn of_format(error: &UnknownFormat, option: &str) -> Option<String> {
-    matches!(error, UnknownFormat::Suffix(_))
-        .then(|| format!("; name it with one of {option} {}", Format::names()))
+    let formats = if option == "--from" { Format::names() } else { Format::written_names() };
+    matches!(error, UnknownFormat::Suffix(_)).then(|| format!("; name it with one of {option} {formats}"))
 }
 
 /// The advice stands behind what is wrong, before the condition itself.

@@ -105,7 +105,7 @@ fn leave(error: &clap::Error) -> ! {
 fn is_wrong_command_line(error: &anyhow::Error) -> bool {
     error.is::<wrong::WrongCommandLine>()
         || error.is::<cantap_signals::condition::ConditionError>()
-        || error.chain().any(advice::is_unknown_format)
+        || advice::is_unknown_format(error)
 }
 
 /// Whether it only says that nobody reads our output any more.

@@ -208,7 +208,8 @@ fn the_input_is_never_overwritten_and_unknown_names_are_refused() {
     assert!(code == Some(1) && err.contains("both input and output"), "{code:?} {err}");
     assert_eq!(fs::read_to_string(directory.join("trace.log")).unwrap(), TRACE);
     let (code, _, err) = cantap(&directory, &["convert", "trace.log", "a.xyz"]);
-    assert!(code == Some(1) && err.contains("--format"), "{code:?} {err}");
+    assert!(code == Some(2) && err.contains("--format"), "{code:?} {err}");
+    assert!(!err.contains("busmaster"), "it can only be read: {err}");
     assert!(!directory.join("a.xyz").exists());
     let (code, _, err) = cantap(&directory, &["convert", "absent.log", "a.asc"]);
     assert!(code == Some(1) && err.contains("absent.log"), "{code:?} {err}");

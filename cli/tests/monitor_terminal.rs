@@ -157,7 +157,7 @@ fn what_is_wrong_with_profile_and_database_is_said_and_the_view_opens_without_it
     };
     let profile = write("car.toml", "device = \"virtual\"\n\nspeed = 5\n");
     let database = write("car.dbc", "VERSION \"\"\nBO_ 291 Engine: 8 ECU\n SG_ Speed : 0|99 nonsense\n");
-    let mut view = Terminal::start(&format!("monitor -p {profile} --db {database}"), (240, 24));
+    let mut view = Terminal::start(&format!("monitor -p {profile} --db {database}"), (300, 24));
     let text =
         view.wait_until("both reasons", |screen| screen.contains("car.toml") && screen.contains("car.dbc"));
     assert!(text.contains("line 3: unknown field `speed`"), "{text}");

@@ -15,19 +15,25 @@ const LEAST_BITRATE_BPS: f64 = 1_500.0;
 
 /// A bit rate in bit/s: `500000`, `500k`, `83.333k`, `1M`.
 pub fn bitrate(text: &str) -> Result<u32, String> {
+    let bps = per_second(text).ok_or("write a bit rate in bit/s, such as 500000, 500k or 1M")?;
+    if f64::from(bps) < LEAST_BITRATE_BPS {
+        return Err(format!("{text} bit/s is slower than any CAN bus; write {text}k for {text} kbit/s"));
+    }
+    Ok(bps)
+}
+
+/// So many in a second, at least one: bits or clock cycles.
+pub fn per_second(text: &str) -> Option<u32> {
     let (number, factor) = match text.as_bytes().last() {
         Some(b'k' | b'K') => (&text[..text.len() - 1], 1_000.0),
         Some(b'm' | b'M') => (&text[..text.len() - 1], 1_000_000.0),
         _ => (text, 1.0),
     };
-    let wrong = || "write a bit rate in bit/s, such as 500000, 500k or 1M".to_owned();
-    let digits = number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.');
-    let value = if digits { number.parse::<f64>().map_err(|_| wrong())? } else { return Err(wrong()) };
-    let bps = (value * factor).round();
-    if (1.0..LEAST_BITRATE_BPS).contains(&bps) {
-        return Err(format!("{text} bit/s is slower than any CAN bus; write {text}k for {text} kbit/s"));
+    if !number.bytes().all(|byte| byte.is_ascii_digit() || byte == b'.') {
+        return None;
     }
-    if (1.0..=f64::from(u32::MAX)).contains(&bps) { Ok(bps as u32) } else { Err(wrong()) }
+    let value = (number.parse::<f64>().ok()? * factor).round();
+    (1.0..=f64::from(u32::MAX)).contains(&value).then_some(value as u32)
 }
 
 /// A time: `400ms`, `3s`, `250us`, `2m`, `1h`, or a number of seconds.

@@ -34,7 +34,7 @@ pub struct Args {
 const MAX_CLOCK_HZ: u32 = 1_000_000_000;
 
 fn clock(text: &str) -> Result<u32, String> {
-    let clock = args::bitrate(text).ok().filter(|clock| *clock <= MAX_CLOCK_HZ);
+    let clock = args::per_second(text).filter(|clock| *clock <= MAX_CLOCK_HZ);
     clock.ok_or_else(|| {
         "write the clock of the CAN controller in Hz, such as 36000000 or 36M, up to 1000M".to_owned()
     })

@@ -171,7 +171,7 @@ fn what_is_wrong_with_profile_and_database_is_said_and_the_view_opens_without_it
         "device = \"virtual:load=30\"\nbitrates = [\"2:250k\", \"fast\"]\nfilters = [\"nonsense,,\"]\nview = \"statistics\"\n\
          send = [\"123#1\"]\n",
     );
-    let mut view = Terminal::start(&format!("monitor -p {profile}"), (240, 24));
+    let mut view = Terminal::start(&format!("monitor -p {profile}"), (300, 24));
     let text = view.wait_for("bit rate fast: ");
     assert!(text.contains("filter nonsense,,: ") && text.contains("to send, 123#1: "), "{text}");
     view.wait_for("Channel 2: 250000 bit/s");

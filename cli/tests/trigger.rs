@@ -38,8 +38,19 @@ fn only_what_is_around_the_event_is_kept() {
 
 #[test]
 fn once_ends_after_the_first_event() {
-    let trigger =
-        ["--trigger", "byte[0] == 3", "--pre", "0", "--post", "5ms", "--once", "--json", "-o", "once.log"];
+    let trigger = [
+        "--trigger",
+        "byte[0] == 3",
+        "--pre",
+        "0",
+        "--post",
+        "5ms",
+        "--once",
+        "--json",
+        "--force",
+        "-o",
+        "once.log",
+    ];
     let (code, out, err) = cantap("once", &[&["capture"][..], &trigger].concat());
     assert_eq!(code, Some(0), "{err}");
     let summary: serde_json::Value = serde_json::from_str(&out).unwrap();

@@ -285,10 +285,14 @@ mod tests {
     fn what_is_no_filter_is_refused_with_a_hint() {
         for (text, message) in [
             (
-                "can0,123",
-                "'123' is no filter; write ID:MASK, such as 123:7FF, or ID~MASK for everything else",
+                "can0,x",
+                "'x' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else",
             ),
-            ("1", "'1' is no interface; write can0 for channel 1, can1 for channel 2, or any"),
+            (
+                "x",
+                "'x' is neither an ID, such as 123, 123:7FF or 09F80102, nor an interface, such as can0 for channel 1, can1 for channel 2, \
+                 or any",
+            ),
             ("can0,12G:7FF", "'12G' is no hexadecimal number of up to 8 digits"),
             ("can0,#", "'' is no hexadecimal number of up to 8 digits"),
             ("can0,+1:7FF", "'+1' is no hexadecimal number of up to 8 digits"),

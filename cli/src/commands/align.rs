@@ -14,6 +14,7 @@ use super::convert::{WriteArgs, refuse_same_file, report};
 use crate::args::duration;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
+use crate::missing::by_kind;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -299,10 +300,6 @@ fn to_json(args: &Args, found: &[Found], left_out: Option<&LeftOut>) -> Value {
             },
         })
     });
-    let left_out: serde_json::Map<_, _> = left_out
-        .into_iter()
-        .flat_map(LeftOut::iter)
-        .map(|(what, count)| (what.to_owned(), count.into()))
-        .collect();
+    let left_out = left_out.map(by_kind).unwrap_or_default();
     json!({ "first": args.traces[0].display().to_string(), "traces": traces.collect::<Vec<_>>(), "left_out": left_out })
 }

@@ -14,6 +14,7 @@ use cantap_trace::filter::Filter;
 use crate::beside::Beside;
 use crate::input::ReadArgs;
 use crate::interrupt;
+use crate::missing::by_kind;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -200,16 +201,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     report(&left_out, &args.output);
     read?;
     if args.json {
-        let object = |counts: &LeftOut| -> serde_json::Map<_, _> {
-            counts.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
-        };
         let missing = records.missing();
         left_out.merge(&missing.left_out);
         let summary = serde_json::json!({
             "records": written,
             "issues": missing.issues,
-            "notes": object(&records.notes()),
-            "left_out": object(&left_out),
+            "notes": by_kind(&records.notes()),
+            "left_out": by_kind(&left_out),
             "missing_pct": missing.share_pct(),
         });
         if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }

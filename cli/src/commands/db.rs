@@ -51,13 +51,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         args.files.iter().map(|path| cantap_signals::load(path)).collect::<Result<_, _>>()?;
     let mut out = BufWriter::new(std::io::stdout().lock());
     if let Some(trace) = &args.coverage {
-        coverage::run(args, databases, trace, &mut out)?;
+        coverage::run(databases, args.j1939, args.read.open(trace)?, args.json, &mut out)?;
     } else if args.warnings {
         warnings(args, &databases, &mut out)?;
     } else if args.messages.is_empty() {
         list(args, &databases, &mut out)?;
     } else {
-        describe::run(args, &databases, &mut out)?;
+        describe::run(&args.messages, args.json, &databases, &mut out)?;
     }
     out.flush()?;
     Ok(ExitCode::SUCCESS)

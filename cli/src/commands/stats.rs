@@ -16,7 +16,8 @@ use self::windows::Windows;
 use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::input::{Missing, ReadArgs};
+use crate::input::ReadArgs;
+use crate::missing::{Missing, by_kind};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -85,7 +86,11 @@ impl Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let live = if args.input.is_some() { None } else { Some(live::open(args)?) };
+    let live = if args.input.is_some() {
+        None
+    } else {
+        Some(live::open(&args.device, &args.channel, &args.bitrates, args.time)?)
+    };
     let mut options = args.options();
     if let Some(live) = &live {
         options.channel_bitrate_bps = live.bit_rates();
@@ -95,7 +100,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut ended = Ok(());
     let mut missing = Missing::default();
     if let Some(mut live) = live {
-        ended = live::run(args, &mut live, &mut statistics, &mut windows);
+        ended = live::run(!args.json, &mut live, &mut statistics, &mut windows);
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {
@@ -143,7 +148,7 @@ fn write_json(
 ) -> anyhow::Result<()> {
     let object = serde_json::to_string(summary)?;
     let members = object.strip_suffix('}').context("a summary is an object")?;
-    let (issues, left_out) = (missing.issues, serde_json::to_string(&missing.by_kind())?);
+    let (issues, left_out) = (missing.issues, serde_json::to_string(&by_kind(&missing.left_out))?);
     let share = missing.share_pct();
     let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };

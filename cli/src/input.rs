@@ -100,6 +100,14 @@ impl Records {
             }
     }
 
+    /// Whether more may come after what is there now.
+    pub const fn grows(&self) -> bool {
+        match &self.source {
+            Source::File(_, grows) => *grows,
+            Source::Device(_) => true,
+        }
+    }
+
     /// Ends a file that grows as soon as this is true; says whether it is one.
     pub fn end_when(&mut self, stop: fn() -> bool) -> bool {
         match &mut self.source {

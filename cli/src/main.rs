@@ -44,6 +44,7 @@ mod rescue;
 mod sending;
 mod stderr;
 mod timing_args;
+mod trace_output;
 mod trigger_args;
 mod words;
 mod wrong;

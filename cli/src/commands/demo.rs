@@ -10,7 +10,7 @@ use anyhow::Context;
 use cantap::device::{Link, Records};
 use cantap::wire::CHANNELS;
 use cantap::{Channel, Device, TraceRecord};
-use cantap_formats::{Format, ReadOptions, TraceWriter, WriteOptions, create_writer, open_reader};
+use cantap_formats::{Format, ReadOptions, WriteOptions, open_reader};
 use cantap_virtual::simbus::Frames;
 use cantap_virtual::{Options, SequenceCheck, start};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -20,6 +20,7 @@ use crate::exit;
 use crate::interrupt;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
+use crate::trace_output::TraceOutput;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -238,7 +239,7 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
 
 /// The captured trace: where the user wants it, or in a temporary file that is read back and removed.
 struct TraceFile {
-    writer: Box<dyn TraceWriter>,
+    writer: TraceOutput,
     temporary: Option<tempfile::TempPath>,
 }
 
@@ -251,7 +252,8 @@ impl TraceFile {
         }
         let path = output.or(temporary.as_deref()).unwrap_or(Path::new("-"));
         let format = path.extension().is_none().then_some(Format::Candump);
-        let writer = create_writer(path, &WriteOptions { format, ..WriteOptions::default() })
+        let options = WriteOptions { format, ..WriteOptions::default() };
+        let writer = TraceOutput::create(path, &options, temporary.is_some())
             .with_context(|| format!("cannot write to '{}'; choose another place with -o", path.display()))?;
         Ok(Self { writer, temporary })
     }

@@ -4,7 +4,6 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use cantap_trace::Interface;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
@@ -80,7 +79,7 @@ fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing)> {
 }
 
 fn name(args: &Args, key: Key) -> String {
-    let channel = if args.ignore_channels { String::new() } else { format!("{} ", Interface(key.channel)) };
+    let channel = if args.ignore_channels { String::new() } else { format!("channel {}, ", key.channel) };
     format!(
         "{channel}{}{}",
         key.id,

@@ -12,7 +12,6 @@ use cantap_signals::Decoder;
 use cantap_trace::filter::Filter;
 
 use crate::address::Address;
-use crate::args;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -24,6 +23,7 @@ use crate::monitor::source::{Order, Origin, Plan};
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
 use crate::wrong::wrong;
+use crate::{args, beside};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -135,7 +135,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         let screen = once(origin, app, model, receiver, args.size, args.time)?;
         match &args.svg {
             None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
-            Some(path) => std::fs::write(path, picture::svg(&screen))
+            Some(path) => beside::write(path, picture::svg(&screen).as_bytes())
                 .with_context(|| format!("cannot write {}", path.display()))?,
         }
     } else {

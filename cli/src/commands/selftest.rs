@@ -16,7 +16,7 @@ use cantap::{Channel, Device};
 use self::report::{Outcome, Report};
 use crate::address::{Address, OpenDevice};
 use crate::boards::OneBoard;
-use crate::{args, exit, interrupt};
+use crate::{args, beside, exit, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     restart(args, &address, device, &serial, &mut report);
     report.finish();
     if let Some(path) = &args.report {
-        std::fs::write(path, report.text()?)
+        beside::write(path, report.text()?.as_bytes())
             .with_context(|| format!("'{}' cannot be written; choose another place", path.display()))?;
     }
     if args.json {

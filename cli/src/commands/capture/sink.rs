@@ -8,7 +8,7 @@ use cantap::TraceRecord;
 use cantap_formats::{TraceWriter, WriteOptions, create_writer};
 use cantap_signals::trigger::Trigger;
 
-use crate::commands::convert::{report as report_left_out, shown};
+use crate::trace_output::{report as report_left_out, shown};
 
 /// Where records go.
 pub struct Sink {

@@ -46,6 +46,8 @@ mod stderr;
 mod timing_args;
 mod trace_output;
 mod trigger_args;
+#[cfg(test)]
+mod vocabulary;
 mod words;
 mod wrong;
 

@@ -195,11 +195,6 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Frames that were asked for and not sent.
-    pub const fn not_sent(&self) -> u64 {
-        self.not_sent
-    }
-
     /// Why, in a sentence with what to do; nothing if all is well.
     pub fn reason(&self) -> Option<String> {
         let Self { asked, not_sent, overtaken, .. } = self;

@@ -159,7 +159,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
 #[test]
 fn device_care_is_one_line_each() {
     for (line, out) in [
-        ("identify -d virtual -s 2", "its LEDs blink for 2 s\n"),
+        ("identify -d virtual -t 2", "its LEDs blink for 2 s\n"),
         ("reset -d virtual", "restarting\n"),
         ("defaults save -d virtual -b 250k --mode normal", "saved on the device\n"),
         ("defaults clear -d virtual", "erased from the device\n"),

@@ -107,9 +107,9 @@ fn a_run_that_is_interrupted_leaves_the_older_file_and_nothing_else() {
 fn what_is_missing_is_in_the_json_of_every_command_that_reads_a_trace() {
     let directory = directory("missing");
     let head = "date Sat Sep 30 15:06:13.191 2017\nbase hex  timestamps absolute\ninternal events logged\n";
-    let frames: String = (0..60).map(|at| format!("0.{at:02} 1 100 Rx d 4 11 {at:02X} 33 44\n")).collect();
+    let frames: Vec<_> = (0..60).map(|at| format!("0.{at:02} 1 100 Rx d 4 11 {at:02X} 33 44\n")).collect();
     let more = "0.7 L1 3e Rx 1 00\n0.7 L1 3e Rx 1 00\n0.8 1 12G Rx d 0\n";
-    fs::write(directory.join("mixed.asc"), format!("{head}{frames}{more}")).unwrap();
+    fs::write(directory.join("mixed.asc"), format!("{head}{}{more}", frames.concat())).unwrap();
     for (line, times) in [
         ("stats mixed.asc", 1),
         ("convert mixed.asc out.log", 1),

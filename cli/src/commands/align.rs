@@ -277,7 +277,9 @@ fn to_json(args: &Args, found: &[Found], missing: &[Missing], not_carried: &Left
     let mut object =
         json!({ "first": args.traces[0].display().to_string(), "traces": traces.collect::<Vec<_>>() });
     let mut all = Missing::default();
-    missing.iter().for_each(|missing| all.merge(missing));
+    for missing in missing {
+        all.merge(missing);
+    }
     all.left_out.merge(not_carried);
     all.put_into(&mut object);
     object["missing_pct"] = missing.iter().map(Missing::share_pct).collect();

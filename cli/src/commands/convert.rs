@@ -8,6 +8,7 @@ use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone};
 use cantap_trace::filter::Filter;
 
+use crate::args;
 use crate::input::ReadArgs;
 use crate::interrupt;
 use crate::missing::by_kind;
@@ -51,8 +52,8 @@ pub struct Args {
     /// Only these frames, as FILTER.
     #[arg(short, long = "filter", value_name = "FILTER")]
     filter_options: Vec<Filter>,
-    /// Only this channel, from 1. Repeat for any of several.
-    #[arg(short, long, value_name = "N")]
+    /// Only these channels: 1, 2, several as 1,3. Can be repeated. All without it.
+    #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
     channel: Vec<u8>,
     /// From here on: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in UTC.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]

@@ -30,12 +30,12 @@ use crate::trace_output::TraceOutput;
                         Exit code 0 means that every frame sent was received in order or counted lost.\n\n\
                         Examples:\n  cantap demo\n  cantap demo --stall 400ms     the device's queue bridges it\n  \
                         cantap demo --stall 3s        frames are lost, and every one is counted\n  \
-                        cantap demo --frames ext8 --load 80 --seconds 20 --json"
+                        cantap demo --frames ext8 --load 80 --time 20s --json"
 )]
 pub struct Args {
-    /// How long to capture, in seconds or as 500ms, 2m.
-    #[arg(long, default_value = "5", value_parser = args::duration)]
-    seconds: Duration,
+    /// How long to capture, as 10, 500ms or 2m.
+    #[arg(short, long, alias = "seconds", value_name = "TIME", default_value = "5s", value_parser = args::positive_duration)]
+    time: Duration,
     /// Bus load in per cent.
     #[arg(long, default_value = "100", value_name = "PCT", value_parser = args::percent)]
     load: f64,
@@ -83,7 +83,7 @@ struct Summary {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
-    let length = args.stall.map_or(args.seconds, |stall| args.seconds.max(stall + 2 * AROUND_STALL));
+    let length = args.stall.map_or(args.time, |stall| args.time.max(stall + 2 * AROUND_STALL));
     let options = Options { load_percent: args.load, frames: args.frames, ..Options::default() };
     let connection = start(options.clone())?;
     let witness = Arc::clone(&connection.witness);

@@ -76,7 +76,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", requires = "once")]
     svg: Option<PathBuf>,
     /// With --once: how long to watch a device.
-    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     time: Duration,
     /// With --once: the screen's size.
     #[arg(long, value_name = "COLUMNSxROWS", default_value = "80x24", value_parser = size)]

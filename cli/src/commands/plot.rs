@@ -46,10 +46,10 @@ pub struct Args {
     #[arg(long, value_name = "ID", conflicts_with = "signals")]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE", requires = "bus_load")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load")]
     bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
-    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
     /// The file to write: .svg, .png or .html.
     #[arg(short, long, value_name = "FILE")]
@@ -121,7 +121,7 @@ struct Read {
     first_ns: Option<i64>,
     missing: Missing,
     /// Signals that were too many.
-    not_drawn: usize,
+    not_drawn: u64,
 }
 
 fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {

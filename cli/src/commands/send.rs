@@ -46,7 +46,7 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     /// Send again and again, by the device's own timer, at least 47us apart.
-    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    #[arg(long, value_name = "TIME", value_parser = args::duration)]
     period: Option<Duration>,
     /// How many times each frame is sent. Without --period and --on-rx they follow one another at once.
     #[arg(short = 'n', long, value_parser = clap::value_parser!(u32).range(1..))]
@@ -58,7 +58,7 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["period", "on_rx"])]
     reply: bool,
     /// End after this time. Without it and --count, periodic frames and replies go on until Ctrl-C.
-    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     #[command(flatten)]
     modifiers: modifiers::ModifierArgs,

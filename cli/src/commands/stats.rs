@@ -45,7 +45,7 @@ pub struct Args {
     /// repeated. Without it a channel with switched bit rates has no load.
     #[arg(
         long = "data-bitrate",
-        value_name = "[CHANNEL:]BITRATE",
+        value_name = "[CHANNEL:]RATE",
         conflicts_with = "device",
         requires = "bitrates"
     )]
@@ -57,13 +57,13 @@ pub struct Args {
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.
-    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
     /// List every window.
     #[arg(long)]
     windows: bool,
     /// List every identifier with count, period, jitter and DLCs.
-    #[arg(short, long)]
+    #[arg(long)]
     per_id: bool,
     /// Print one JSON object, identifiers included.
     #[arg(long)]

@@ -8,7 +8,7 @@ use clap::{Arg, ArgAction, Command, CommandFactory};
 use crate::Cli;
 
 /// The option that a letter is short for.
-const LETTERS: [(char, &[&str]); 19] = [
+const LETTERS: [(char, &[&str]); 20] = [
     ('A', &["after-context"]),
     ('B', &["before-context"]),
     ('C', &["context"]),
@@ -30,6 +30,7 @@ const LETTERS: [(char, &[&str]); 19] = [
     ('t', &["time"]),
     ('v', &["verbose"]),
     ('w', &["window"]),
+    ('y', &["yes"]),
 ];
 
 /// Letters of can-utils, which users of `cangen` and `canplayer` type without looking.
@@ -78,7 +79,8 @@ fn a_name_takes_one_kind_of_value_in_every_command() {
         else {
             return;
         };
-        let values = argument.get_value_names().unwrap_or_default().join(" ");
+        // A value for all channels, or for one.
+        let values = argument.get_value_names().unwrap_or_default().join(" ").replace("[CHANNEL:]", "");
         let takes = matches!(argument.get_action(), ArgAction::Set | ArgAction::Append);
         let kind = if takes { values } else { "nothing".to_owned() };
         kinds.entry(long.to_owned()).or_default().entry(kind).or_default().push(command.to_owned());

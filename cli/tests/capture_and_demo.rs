@@ -390,7 +390,7 @@ fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
 
 #[test]
 fn a_demo_that_stalls_too_long_counts_every_frame_it_loses() {
-    let (code, out, _) = cantap("demo --time 1 --stall 1500ms --frames ext8 --json");
+    let (code, out, _) = cantap("demo --time 1 --stall 1500ms --kind ext8 --json");
     let object = json(&out);
     assert_eq!((code, object["ok"].as_bool()), (Some(0), Some(true)), "{out}");
     for channel in object["channels"].as_array().unwrap() {

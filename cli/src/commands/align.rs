@@ -32,7 +32,7 @@ pub struct Args {
     #[arg(value_name = "TRACE", required = true, num_args = 2..)]
     traces: Vec<PathBuf>,
     /// The trace to write, with all channels.
-    #[arg(short, long, value_name = "OUT")]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// The format of the traces, where neither their names nor their beginnings tell.
     #[arg(long, value_name = "FORMAT")]

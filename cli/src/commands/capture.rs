@@ -55,7 +55,7 @@ pub struct Args {
     #[arg(short, long, value_name = "FILTER")]
     filter: Vec<Filter>,
     /// File to write; its suffix picks the format, if --format does not. Without a suffix it is a candump log.
-    #[arg(short, long)]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Write over a file that is there already.
     #[arg(long, requires = "output")]

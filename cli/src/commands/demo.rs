@@ -30,7 +30,7 @@ use crate::trace_output::TraceOutput;
                         Exit code 0 means that every frame sent was received in order or counted lost.\n\n\
                         Examples:\n  cantap demo\n  cantap demo --stall 400ms     the device's queue bridges it\n  \
                         cantap demo --stall 3s        frames are lost, and every one is counted\n  \
-                        cantap demo --frames ext8 --load 80 --time 20s --json"
+                        cantap demo --kind ext8 --load 80 --time 20s --json"
 )]
 pub struct Args {
     /// How long to capture, as 10, 500ms or 2m.
@@ -40,13 +40,13 @@ pub struct Args {
     #[arg(long, default_value = "100", value_name = "PCT", value_parser = args::percent)]
     load: f64,
     /// Which frames: std0, std8, ext0, ext8, rtr or mix.
-    #[arg(long, default_value = "std0")]
-    frames: Frames,
+    #[arg(long, alias = "frames", default_value = "std0")]
+    kind: Frames,
     /// The host stops reading for this time in mid-run.
     #[arg(long, value_name = "TIME", value_parser = args::duration)]
     stall: Option<Duration>,
     /// Keep the captured trace in this file.
-    #[arg(short, long)]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
@@ -84,7 +84,7 @@ struct Summary {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
     let length = args.stall.map_or(args.time, |stall| args.time.max(stall + 2 * AROUND_STALL));
-    let options = Options { load_percent: args.load, frames: args.frames, ..Options::default() };
+    let options = Options { load_percent: args.load, frames: args.kind, ..Options::default() };
     let connection = start(options.clone())?;
     let witness = Arc::clone(&connection.witness);
     let stall = Stall::default();
@@ -208,7 +208,7 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
     writeln!(
         out,
         "two channels at 1 Mbit/s, {} % load of {} frames, {} s",
-        args.load, args.frames, summary.seconds
+        args.load, args.kind, summary.seconds
     )?;
     for channel in &summary.channels {
         let ChannelSummary { channel, sent, delivered, lost, frames_per_s, bus_load_pct } = channel;

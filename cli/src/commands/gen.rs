@@ -63,7 +63,7 @@ pub struct Args {
     #[arg(short = 'D', long, value_name = "MODE|HEX", default_value = "r", value_parser = data)]
     data: Data,
     /// End after this many frames.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Frames of a burst: they follow one another at once, and the gap is from burst to burst.
     #[arg(short = 'c', long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]

@@ -61,7 +61,7 @@ pub struct Args {
     #[arg(long, default_value_t = 1.0, value_parser = speed)]
     speed: f64,
     /// End after this many frames.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Wait for Enter before the first frame.
     #[arg(short, long)]

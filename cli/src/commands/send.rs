@@ -49,7 +49,7 @@ pub struct Args {
     #[arg(long, value_name = "TIME", value_parser = args::duration)]
     period: Option<Duration>,
     /// How many times each frame is sent. Without --period and --on-rx they follow one another at once.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
     /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump.
     #[arg(long, value_name = "FILTER", conflicts_with = "period")]

@@ -70,7 +70,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if conversations.is_none() && surveyed.take(&mut batch, more) {
             let found = surveyed.found();
             if !args.quiet {
-                surveyed.tell(found.as_deref());
+                surveyed::tell(found.as_deref());
             }
             let (protocols, pairs) = (args.protocols.clone(), args.pairs.clone());
             conversations = Some(Conversations::new(Options { protocols, pairs, spoken: found }));

@@ -42,29 +42,29 @@ impl Surveyed {
         self.survey.as_ref().map(Survey::found)
     }
 
-    /// Says what was found.
-    pub fn tell(&self, found: Option<&[Evidence]>) {
-        let Some(found) = found else { return };
-        if found.is_empty() {
-            eprintln!(
-                "cantap: no protocol is known by its first frames; name one with --protocol to read the trace by it"
-            );
-            return;
-        }
-        let mut channels: Vec<(u8, Vec<&str>)> = Vec::new();
-        for Evidence { channel, protocol, .. } in found {
-            match channels.last_mut().filter(|(last, _)| last == channel) {
-                Some((_, names)) => names.push(protocol.name()),
-                None => channels.push((*channel, vec![protocol.name()])),
-            }
-        }
-        for (channel, names) in channels {
-            eprintln!("cantap: channel {channel} speaks {}", names.join(", "));
-        }
-    }
-
     /// The records that waited.
     pub fn release(&mut self) -> Vec<TraceRecord> {
         std::mem::take(&mut self.waiting)
+    }
+}
+
+/// Says what was found.
+pub(super) fn tell(found: Option<&[Evidence]>) {
+    let Some(found) = found else { return };
+    if found.is_empty() {
+        eprintln!(
+            "cantap: no protocol is known by its first frames; name one with --protocol to read the trace by it"
+        );
+        return;
+    }
+    let mut channels: Vec<(u8, Vec<&str>)> = Vec::new();
+    for Evidence { channel, protocol, .. } in found {
+        match channels.last_mut().filter(|(last, _)| last == channel) {
+            Some((_, names)) => names.push(protocol.name()),
+            None => channels.push((*channel, vec![protocol.name()])),
+        }
+    }
+    for (channel, names) in channels {
+        eprintln!("cantap: channel {channel} speaks {}", names.join(", "));
     }
 }

@@ -73,7 +73,7 @@ impl Diagnostics {
         } else if sid & 0x40 == 0 && self.service(&transfer, sid).is_some() {
             self.request(transfer, events);
         } else if sid & 0x40 != 0 && self.service(&transfer, sid & !0x40).is_some() {
-            self.response(transfer, events);
+            self.response(&transfer, events);
         } else {
             events.push(transfer.into());
         }
@@ -137,13 +137,13 @@ impl Diagnostics {
         self.waiting.iter().position(physical).or_else(|| self.waiting.iter().position(functional))
     }
 
-    fn response(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
-        match self.asked(&transfer, transfer.data[0] & !0x40) {
+    fn response(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
+        match self.asked(transfer, transfer.data[0] & !0x40) {
             Some(place) => {
                 let answered = self.answered(place);
-                events.push(self.event(&answered.request, Some((&transfer, &answered)), "exchange"));
+                events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
             }
-            None => events.push(self.unasked(&transfer)),
+            None => events.push(self.unasked(transfer)),
         }
     }
 

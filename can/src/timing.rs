@@ -1,4 +1,4 @@
-//! Bit timing: what a controller is told, and every way to reach a bit rate.
+//! Bit timing: what a controller is set to, and every way to reach a bit rate.
 //!
 //! Ranges are bxCAN's (RM0090, "CAN bit timing register"): prescaler 1 to 1024, bit segment 1
 //! (propagation and phase segment 1) 1 to 16, bit segment 2 1 to 8, jump width 1 to 4 quanta. A bit

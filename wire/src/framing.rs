@@ -1,4 +1,4 @@
-//! How a message stands in the byte stream: COBS of (message, CRC), then a zero byte.
+//! How a message is framed in the byte stream: COBS of (message, CRC), then a zero byte.
 //!
 //! COBS only says where a message ends; a damaged message can still be well-formed COBS. The CRC
 //! is what proves it.
@@ -11,7 +11,7 @@ pub const MAX_MESSAGE: usize = 2048;
 /// Largest request before CRC and COBS, in bytes: what a device must be ready to hold. The longest there is sets
 /// [`MAX_FILTERS`](crate::message::MAX_FILTERS) filters of 12 bytes each.
 pub const MAX_REQUEST: usize = 704;
-/// Bytes of the CRC, which stands little-endian behind the message.
+/// Bytes of the CRC, which follows the message, little-endian.
 pub const CRC_LEN: usize = 4;
 
 /// Bytes that a message of `len` bytes takes on the wire at most: CRC, one COBS byte for each
@@ -87,7 +87,7 @@ pub fn seal_with(
     Some(encoded + 1)
 }
 
-/// Decodes what stands between two zero bytes into `out`, which must be at least as long, and
+/// Decodes what is between two zero bytes into `out`, which must be at least as long, and
 /// returns the message without its CRC.
 pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], FramingError> {
     if out.len() < encoded.len() {

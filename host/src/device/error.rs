@@ -180,7 +180,7 @@ impl fmt::Display for SessionOver {
     }
 }
 
-/// Why a connection is of no use any more; kept to be told to everybody who asks for something.
+/// Why a connection is of no use any more; kept as the answer to every later request.
 #[derive(Clone, Debug)]
 pub(super) enum Gone {
     Vanished(String),

@@ -3,6 +3,8 @@
 //! COBS only says where a message ends; a damaged message can still be well-formed COBS. The CRC
 //! is what proves it.
 
+use core::fmt;
+
 use crc::Crc;
 use serde::Serialize;
 
@@ -54,6 +56,18 @@ pub enum FramingError {
     /// The CRC does not match.
     Crc,
 }
+
+impl fmt::Display for FramingError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Cobs => "not COBS",
+            Self::Short => "shorter than a CRC",
+            Self::Crc => "the CRC does not match",
+        })
+    }
+}
+
+impl core::error::Error for FramingError {}
 
 /// Writes `message` to `out` as it goes over the wire and returns the length. `buffer` is room for the message and its CRC.
 /// `None` if either is too short.

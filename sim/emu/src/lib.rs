@@ -1,4 +1,4 @@
-//! An STM32F405 or F407 that runs an unmodified program instruction by instruction, with two CAN buses and a USB host attached.
+#![doc = include_str!("../README.md")]
 //!
 //! It knows nothing of what the program is for. What it must know is in [`Setup`]: the core's clock, the board's crystal, which
 //! interrupts' masking is to be measured. Time is core cycles everywhere ([`Clock`]); nothing here looks at the host's clock, so the

@@ -21,6 +21,7 @@ pub fn check() -> Result<()> {
         let text = fs::read_to_string(&path).with_context(|| path.display().to_string())?;
         pages.insert(path, Page::parse(&text));
     }
+    ensure!(!pages.is_empty(), "no page in {}", root.display());
     let faults: Vec<String> =
         pages.iter().flat_map(|(path, page)| page.faults(&root, path, &pages)).collect();
     ensure!(faults.is_empty(), "links that lead nowhere:\n{}", faults.join("\n"));

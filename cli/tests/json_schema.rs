@@ -32,6 +32,10 @@ fn directory(test: &str) -> PathBuf {
                     BO_ 800 Never: 8 A\n SG_ X M : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ Y m1 : 8|8@1- (1,-40) [-40|80] \"\" A\n\
                     CM_ SG_ 256 S \"Speed\";\nVAL_ 256 T 1 \"on\" 0 \"off\" ;\n\
                     BA_DEF_ BO_ \"GenMsgCycleTime\" INT 0 1000;\nBA_ \"GenMsgCycleTime\" BO_ 256 100;\n";
+    let talk = "(1.000000) can0 7E0#0322F190AAAAAAAA\n(1.002500) can0 7E8#101462F190575657\n(1.003000) can0 7E0#300000AAAAAAAAAA\n\
+                (1.004000) can0 7E8#215A5A5A314B5A41\n(1.005000) can0 7E8#2257303030303031\n(2.000000) can0 7DF#02010CAAAAAAAAAA\n\
+                (2.001000) can0 7E8#04410C1AF8AAAAAA\n(3.000000) can0 7E0#021003AAAAAAAAAA\n";
+    fs::write(directory.join("talk.log"), talk).unwrap();
     fs::write(directory.join("car.dbc"), database).unwrap();
     fs::write(directory.join("odd.dbc"), database.replace("8|8@1-", "8|99@1-")).unwrap();
     directory
@@ -47,7 +51,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line, without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-const LINES: [(&str, i32, &[&str]); 41] = [
+const LINES: [(&str, i32, &[&str]); 42] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("status -d virtual --registers", 0, &["status"]),
@@ -84,6 +88,7 @@ const LINES: [(&str, i32, &[&str]); 41] = [
     ("decode a.log --db car.dbc --details", 0, &["decode", "decode_end"]),
     ("search a.log --db car.dbc --id 100 -C 2", 0, &["search", "search_end"]),
     ("search a.log error%or%rtr", 0, &["search", "search_end"]),
+    ("conversations talk.log", 0, &["conversations", "conversations_end"]),
     ("diff a.log b.log", 0, &["diff"]),
     ("diff b.log a.log --ignore-channels", 0, &["diff"]),
     ("plot a.log --db car.dbc -o out.svg", 0, &["plot"]),

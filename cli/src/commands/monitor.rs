@@ -15,6 +15,7 @@ use crate::address::Address;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::databases::{self, DatabaseArgs};
 use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
@@ -39,10 +40,10 @@ pub struct Args {
     #[arg(value_name = "FILE", conflicts_with = "devices")]
     file: Option<PathBuf>,
     /// The device. Repeat for several, whose channels are numbered on: the second one's are 3 and 4.
-    #[arg(short, long = "device", value_name = "DEVICE")]
+    #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which is all. Without it, those whose bit rate is given; all if none is.
-    #[arg(short, long, value_parser = args::channels, conflicts_with = "file")]
+    #[arg(short, long, value_parser = args::channels, conflicts_with = "file", add = completion::channels())]
     channel: Option<args::Channels>,
     #[command(flatten)]
     open: ChannelArgs,

@@ -1,8 +1,8 @@
 //! Databases from ARXML files, AUTOSAR's system descriptions of version 3 and 4.
 //!
 //! A frame's identifier stands where a CAN channel sends it, its signals in the PDUs that are mapped into it, and how their bits become
-//! values in yet other places, named by paths. Container and secured PDUs are not read: their frames keep what else is in them, with a
-//! warning.
+//! values in yet other places, named by paths. Of a secured PDU the payload is read, which stands in front of its authenticator. What a
+//! container PDU holds says each frame anew, so it is not read: its frames keep what else is in them, with a warning.
 
 use std::collections::{HashMap, HashSet};
 
@@ -189,11 +189,15 @@ impl<'a> Reader<'a> {
     fn pdu(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
         match pdu.tag_name().name() {
             "MULTIPLEXED-I-PDU" => self.multiplexed(pdu, target),
-            "CONTAINER-I-PDU" | "SECURED-I-PDU" => {
-                let kind = pdu.tag_name().name();
-                self.warn(pdu, target.name, &format!("{} is a {kind}, which is not read", short_name(pdu)));
+            "CONTAINER-I-PDU" => {
+                let name = short_name(pdu);
+                let reason = format!(
+                    "{name} is a container PDU: what a frame holds stands in the frame itself, and is not read"
+                );
+                self.warn(pdu, target.name, &reason);
                 Ok(())
             }
+            "SECURED-I-PDU" => self.secured(pdu, target),
             _ => {
                 target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
                 let mappings = within(pdu, "I-SIGNAL-TO-I-PDU-MAPPING");
@@ -218,6 +222,34 @@ impl<'a> Reader<'a> {
                         Err(kind) => return Err((i_signal, kind)),
                     }
                 }
+                Ok(())
+            }
+        }
+    }
+
+    /// A PDU with the payload of another one in front of what proves who sent it.
+    fn secured(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
+        let name = short_name(pdu);
+        if content(pdu, "USE-AS-CRYPTOGRAPHIC-I-PDU").as_deref() == Some("true") {
+            self.warn(
+                pdu,
+                target.name,
+                &format!("{name} only has the authenticator of a PDU in another frame"),
+            );
+            return Ok(());
+        }
+        target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
+        let triggering = self.reference(pdu, "PAYLOAD-REF");
+        let payload = triggering.and_then(|node| self.reference(node, "I-PDU-REF"));
+        // One that is its own payload would never end.
+        match payload.filter(|payload| payload.tag_name().name() != "SECURED-I-PDU") {
+            Some(payload) => self.pdu(payload, target),
+            None => {
+                self.warn(
+                    pdu,
+                    target.name,
+                    &format!("the payload of {name}, a secured PDU, is not in the file"),
+                );
                 Ok(())
             }
         }

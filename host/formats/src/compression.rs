@@ -56,7 +56,7 @@ impl Compression {
         KNOWN.iter().find(|(.., magic)| head.starts_with(magic)).map(|(compression, ..)| *compression)
     }
 
-    /// What unpacks a file; several members, frames or streams one behind the other are one file.
+    /// What unpacks a file; several members, frames or streams one after another are one file.
     pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
         Ok(match self {
             Self::Gzip => Box::new(flate2::read::MultiGzDecoder::new(source)),
@@ -70,7 +70,7 @@ impl Compression {
     }
 }
 
-/// xz streams one behind the other: the crate's decoder takes a file that ends between two blocks for a whole one.
+/// xz streams one after another: the crate's decoder takes a file that ends between two blocks for a whole one.
 struct XzStreams<R: Read>(lzma_rust2::XzReader<Tail<R>>);
 
 /// A source, and the last two bytes that came from it: zeros may follow a stream.
@@ -111,7 +111,7 @@ impl<R: Read> Read for XzStreams<R> {
     }
 }
 
-/// LZ4 frames one behind the other: the crate's decoder ends with the first.
+/// LZ4 frames one after another: the crate's decoder ends with the first.
 struct Lz4Frames<R: Read> {
     decoder: lz4_flex::frame::FrameDecoder<Peeked<R>>,
     /// Whether a frame has begun whose end mark was not seen.

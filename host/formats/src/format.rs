@@ -199,14 +199,27 @@ impl Format {
             Some(Self::Crtd)
         } else if text.starts_with(b"(") {
             Some(Self::Candump)
-        } else if text.starts_with(b"date ") {
+        } else if is_asc(text) {
             Some(Self::Asc)
-        } else if text.starts_with(b";$FILEVERSION") || text.starts_with(b";####") {
+        } else if text.starts_with(b";$FILEVERSION")
+            || text.starts_with(b";####")
+            || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
+        {
             Some(Self::Trc(TrcVersion::V2_1))
         } else {
             None
         }
     }
+}
+
+/// Whether a text begins as Vector's do: with its date, or with the base of its numbers, and comments in front of them.
+fn is_asc(text: &[u8]) -> bool {
+    let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
+    let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//"));
+    let first = lines.next().unwrap_or_default();
+    ["date ", "base hex", "base dec"]
+        .iter()
+        .any(|word| first.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes())))
 }
 
 impl fmt::Display for Format {
@@ -239,6 +252,9 @@ mod tests {
         for (head, format) in [
             (utf8("(1410714882.622188) can0 123#11\n"), Format::Candump),
             (utf8("date Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
+            (utf8("// a comment\n\ndate Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
+            (utf8("base hex  timestamps absolute\n"), Format::Asc),
+            (utf8(";   Start time: 18.12.2021 14:28:07.062\n;\n"), Format::Trc(TrcVersion::V2_1)),
             (utf8(";$FILEVERSION=1.1\n"), Format::Trc(TrcVersion::V2_1)),
             (utf8("LOGG\0\0\0\0"), Format::Blf),
             (utf8("MDF     4.10    "), Format::Mf4),

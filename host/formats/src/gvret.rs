@@ -44,7 +44,7 @@ impl RowDecoder {
         let raw =
             text::hex(digits).ok_or_else(|| Fault::malformed("an identifier in hexadecimal digits", id))?;
         let extended = match extended {
-            // Files are about that leave the mark out, where the identifier alone says it.
+            // Some files leave the mark out where the identifier alone says it.
             b"false" | b"False" | b"FALSE" | b"0" => raw > 0x7FF,
             b"true" | b"True" | b"TRUE" | b"1" => true,
             other => return Err(Fault::malformed("'true' or 'false' under Extended", other)),

@@ -1,4 +1,4 @@
-//! Reading BLF: the file, its containers, and the objects one behind the other.
+//! Reading BLF: the file, its containers, and the objects one after another.
 
 use std::io;
 

@@ -242,17 +242,11 @@ impl<'a> Reader<'a> {
         let triggering = self.reference(pdu, "PAYLOAD-REF");
         let payload = triggering.and_then(|node| self.reference(node, "I-PDU-REF"));
         // One that is its own payload would never end.
-        match payload.filter(|payload| payload.tag_name().name() != "SECURED-I-PDU") {
-            Some(payload) => self.pdu(payload, target),
-            None => {
-                self.warn(
-                    pdu,
-                    target.name,
-                    &format!("the payload of {name}, a secured PDU, is not in the file"),
-                );
-                Ok(())
-            }
+        if let Some(payload) = payload.filter(|payload| payload.tag_name().name() != "SECURED-I-PDU") {
+            return self.pdu(payload, target);
         }
+        self.warn(pdu, target.name, &format!("the payload of {name}, a secured PDU, is not in the file"));
+        Ok(())
     }
 
     /// A PDU whose selector says which of several others is in it.

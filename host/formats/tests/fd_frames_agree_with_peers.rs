@@ -42,7 +42,7 @@ fn line(record: &TraceRecord) -> String {
     let TraceEvent::Frame { frame, direction, .. } = &record.event else { panic!("{record:?}") };
     let direction = if *direction == Direction::Tx { "Tx" } else { "Rx" };
     let extended = if frame.id().is_extended() { "x" } else { "-" };
-    let data: String = frame.data().iter().map(|byte| format!("{byte:02X}")).collect();
+    let data = frame.data().iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
     let data = if data.is_empty() { "-".to_owned() } else { data };
     let (kind, flags) = match frame.fd() {
         Some(frame) => ("fd", format!(" {}", frame.flags())),

@@ -89,7 +89,14 @@ struct Target<'m> {
     offset: u16,
     signals: Vec<Signal>,
     cycle_ms: Option<u32>,
+    /// How deep the PDU is that is being read, and how many were read for this frame.
+    depth: u32,
+    pdus: u32,
 }
+
+/// PDUs of PDUs go no deeper than this, and no frame has more of them: a file can name one as a part of itself.
+const MOST_DEPTH: u32 = 8;
+const MOST_PDUS: u32 = 1000;
 
 impl<'a> Reader<'a> {
     /// Notes the path of everything below `node`.
@@ -149,7 +156,8 @@ impl<'a> Reader<'a> {
             fault(FaultKind::MessageLength(length.unsigned_abs()));
             return None;
         };
-        let mut target = Target { name: &name, offset: 0, signals: Vec::new(), cycle_ms: None };
+        let mut target =
+            Target { name: &name, offset: 0, signals: Vec::new(), cycle_ms: None, depth: 0, pdus: 0 };
         let mappings = within(frame, "PDU-TO-FRAME-MAPPING");
         for mapping in mappings.collect::<Vec<_>>() {
             let start =
@@ -187,6 +195,22 @@ impl<'a> Reader<'a> {
     }
 
     fn pdu(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
+        target.pdus += 1;
+        if target.depth >= MOST_DEPTH || target.pdus > MOST_PDUS {
+            let reason = "its PDUs are made of each other without an end, or are too many".to_owned();
+            return Err((pdu, FaultKind::Syntax(reason)));
+        }
+        target.depth += 1;
+        let result = self.pdu_of_any_kind(pdu, target);
+        target.depth -= 1;
+        result
+    }
+
+    fn pdu_of_any_kind(
+        &mut self,
+        pdu: Node<'a, 'a>,
+        target: &mut Target,
+    ) -> Result<(), (Node<'a, 'a>, FaultKind)> {
         match pdu.tag_name().name() {
             "MULTIPLEXED-I-PDU" => self.multiplexed(pdu, target),
             "CONTAINER-I-PDU" => {
@@ -241,8 +265,7 @@ impl<'a> Reader<'a> {
         target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
         let triggering = self.reference(pdu, "PAYLOAD-REF");
         let payload = triggering.and_then(|node| self.reference(node, "I-PDU-REF"));
-        // One that is its own payload would never end.
-        if let Some(payload) = payload.filter(|payload| payload.tag_name().name() != "SECURED-I-PDU") {
+        if let Some(payload) = payload {
             return self.pdu(payload, target);
         }
         self.warn(pdu, target.name, &format!("the payload of {name}, a secured PDU, is not in the file"));

@@ -123,6 +123,32 @@ fn the_payload_of_a_secured_pdu_is_read_and_of_a_container_it_is_said_that_it_is
     );
 }
 
+/// Each PDU is a part of itself, once and many times over: the first ended the program, the second would have taken years.
+#[test]
+fn pdus_that_are_parts_of_themselves_leave_their_frame_out() {
+    for parts in [1, 40] {
+        let part = "<STATIC-PART><I-PDU-REF>/P/Pdu</I-PDU-REF></STATIC-PART>".repeat(parts);
+        let text = ARXML
+            .replace(
+                "<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>",
+                &format!("<MULTIPLEXED-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>{part}"),
+            )
+            .replace("</I-SIGNAL-I-PDU>", "</MULTIPLEXED-I-PDU>");
+        let error = arxml::parse("x.arxml", text.as_bytes()).map(|database| database.warnings);
+        let texts = match error {
+            Ok(warnings) => warnings.iter().map(ToString::to_string).collect(),
+            Err(error) => error.to_string(),
+        };
+        assert!(texts.contains("without an end"), "{texts}");
+    }
+    let text = ARXML
+        .replace("<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>", "<SECURED-I-PDU><SHORT-NAME>Pdu</SHORT-NAME><PAYLOAD-REF>/P/C/Tr</PAYLOAD-REF>")
+        .replace("</I-SIGNAL-I-PDU>", "</SECURED-I-PDU>")
+        .replace("<X><CAN-FRAME-TRIGGERING>", "<X><PDU-TRIGGERING><SHORT-NAME>Tr</SHORT-NAME><I-PDU-REF>/P/Pdu</I-PDU-REF></PDU-TRIGGERING><CAN-FRAME-TRIGGERING>");
+    let result = arxml::parse("x.arxml", text.as_bytes());
+    assert!(result.is_err() || result.is_ok_and(|database| database.messages.is_empty()));
+}
+
 type Parse = fn(&str, &[u8]) -> Result<Database, DatabaseError>;
 
 #[test]

@@ -43,17 +43,17 @@ fn lengths_and_crcs_are_those_of_the_model() {
     };
     let frames = frames();
     let mut stdin = model.stdin.take().unwrap();
-    let lines: String = frames
+    let lines: Vec<String> = frames
         .iter()
         .map(|frame| {
-            let data: String = frame.data().iter().map(|byte| format!("{byte:02x}")).collect();
+            let data = frame.data().iter().map(|byte| format!("{byte:02x}")).collect::<Vec<_>>().concat();
             let (extended, data) =
                 (if frame.id().is_extended() { "x" } else { "-" }, if data.is_empty() { "-" } else { &data });
             let (brs, esi) = (u8::from(frame.brs()), u8::from(frame.esi()));
             format!("{:x} {extended} {brs} {esi} {data}\n", frame.id().raw())
         })
         .collect();
-    let writer = std::thread::spawn(move || stdin.write_all(lines.as_bytes()));
+    let writer = std::thread::spawn(move || stdin.write_all(lines.concat().as_bytes()));
     let output = model.wait_with_output().unwrap();
     writer.join().unwrap().unwrap();
     assert!(output.status.success());

@@ -15,7 +15,7 @@ use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::Interface;
 
 use self::sheet::SheetPath;
-use self::summary::{Summary, is_fault};
+use self::summary::Summary;
 use self::surveyed::Surveyed;
 use super::decode::Seconds;
 use crate::databases::DatabaseArgs;
@@ -127,6 +127,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         summary.tell();
     }
     Ok(ExitCode::SUCCESS)
+}
+
+fn is_fault(event: &Event) -> bool {
+    event.trouble.is_some() || event.frames_lost || event.kind == "refusal"
 }
 
 fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {

@@ -20,7 +20,9 @@ use crate::databases::{self, DatabaseArgs};
 use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
 use crate::monitor::profile::Profile;
-use crate::monitor::source::{Order, Origin, Plan};
+use crate::monitor::order::Order;
+use crate::monitor::plan::Plan;
+use crate::monitor::source::Origin;
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
 use crate::wrong::wrong;
@@ -112,7 +114,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let filters = filters(args, &profile, &mut complaints);
     model.history.set_filters(filters, None);
     for name in &profile.graph {
-        model.seen.signals.choose(name);
+        if let Err(error) = model.seen.signals.choose(name) {
+            complaints.push(format!("graph: {error}"));
+        }
     }
     let (origin, plan) = if let Some(path) = &args.file {
         (Origin::File(path.clone()), None)

@@ -5,7 +5,9 @@ pub mod app;
 mod event_text;
 mod keyboard;
 pub mod model;
+pub mod order;
 pub mod picture;
+pub mod plan;
 pub mod profile;
 mod recorder;
 mod screen;
@@ -13,6 +15,7 @@ pub mod source;
 #[cfg(test)]
 mod tests;
 pub mod theme;
+mod times;
 pub mod views;
 
 use std::sync::mpsc::channel;
@@ -30,7 +33,8 @@ use app::{App, Flow};
 use keyboard::{Keyboard, Waited};
 use model::{Model, SourceState};
 use screen::Screen;
-use source::{Order, Origin, Shared, lock};
+use order::Order;
+use source::{Origin, Shared, lock};
 
 /// The display is drawn anew so often: 25 times a second.
 const FRAME: Duration = Duration::from_millis(40);

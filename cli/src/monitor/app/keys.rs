@@ -2,10 +2,12 @@
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
+use super::super::event_text::candump_line;
 use super::super::model::Model;
-use super::super::source::{Order, Plan};
-use super::super::views::{self, trace};
+use super::super::order::Order;
+use super::super::plan::Plan;
 use super::line::PromptKind;
+use super::scroll::first_row;
 use super::state::{App, Direction, Flow, View};
 
 /// The row where a page's own rows begin, its heading.
@@ -104,18 +106,10 @@ impl App {
             (View::Fixed, KeyCode::Char(key @ ('x' | 'o'))) => self.mark_row(key == 'x', model),
             (View::Signals, KeyCode::Enter) => {
                 if let Some(row) = self.signal_order.get(self.selected).copied() {
-                    self.each_seen(model, |seen| seen.signals.toggle(row));
+                    self.toggle_signal(row, model);
                 }
             }
-            (View::Graph, KeyCode::Char('+') | KeyCode::Up) => {
-                self.graph_span = (self.graph_span / 2.0).max(0.1);
-            }
-            (View::Graph, KeyCode::Char('-') | KeyCode::Down) => {
-                self.graph_span = (self.graph_span * 2.0).min(600.0);
-            }
-            (View::Graph, KeyCode::Left) => self.move_graph_cursor(-0.02),
-            (View::Graph, KeyCode::Right) => self.move_graph_cursor(0.02),
-            (View::Graph, KeyCode::Esc) => self.graph_cursor = None,
+            (View::Graph, code) => self.graph.key(code),
             (View::Send, KeyCode::Enter) => self.send_once(),
             (View::Send, KeyCode::Char('a')) => self.ask(PromptKind::Send, ""),
             (View::Send, KeyCode::Char('e')) => self.edit_entry(),
@@ -140,33 +134,40 @@ impl App {
         });
     }
 
+    /// Puts a signal into the graph, or takes it out, in what is shown and in what goes on behind it.
+    fn toggle_signal(&mut self, row: usize, model: &mut Model) {
+        let Model { history, seen, .. } = model;
+        for seen in std::iter::once(seen).chain(self.frozen.as_deref_mut()) {
+            seen.signals.toggle(row, history.all());
+        }
+    }
+
     fn copy(&mut self, model: &Model) {
         let place = self.cursor.or(model.history.end().checked_sub(1));
-        self.clipboard = place.and_then(|place| trace::candump_line(model, place));
+        self.clipboard = place.and_then(|place| candump_line(&model.history.get(place)?));
         let said = if self.clipboard.is_some() { "copied" } else { "this is no frame; nothing was copied" };
         said.clone_into(&mut self.message);
     }
 
-    fn move_graph_cursor(&mut self, by: f64) {
-        self.graph_cursor = Some((self.graph_cursor.unwrap_or(1.0) + by).clamp(0.0, 1.0));
-    }
-
     /// The mouse was used.
     pub fn mouse(&mut self, event: MouseEvent, model: &mut Model) {
+        let is_busy = self.prompt.is_some() || self.help;
+        if self.view == View::Graph && event.row > 0 && !is_busy {
+            return self.graph.mouse(event);
+        }
         let code = match event.kind {
             MouseEventKind::ScrollUp => KeyCode::Up,
             MouseEventKind::ScrollDown => KeyCode::Down,
             MouseEventKind::Down(MouseButton::Left) => {
-                if self.prompt.is_none() && !self.help {
+                if !is_busy {
                     self.click(event, model);
                 }
                 return;
             }
             _ => return,
         };
-        if self.prompt.is_none() && !self.help {
-            // On the graph, a step of the wheel is a step of the zoom.
-            for _ in 0..if self.view == View::Graph { 1 } else { WHEEL_ROWS } {
+        if !is_busy {
+            for _ in 0..WHEEL_ROWS {
                 self.page_key(code, model);
             }
         }
@@ -174,20 +175,20 @@ impl App {
 
     fn click(&mut self, event: MouseEvent, model: &Model) {
         if event.row == 0 {
-            if let Some(view) = views::tab_at(event.column) {
+            if let Some(view) = View::at_column(event.column) {
                 self.show(view);
             }
             return;
         }
         // The page begins with a heading; the send list's stands below a sentence.
-        let first_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
-        let Some(row) = event.row.checked_sub(first_row).map(usize::from).filter(|row| *row < self.page_rows)
+        let body_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
+        let Some(row) = event.row.checked_sub(body_row).map(usize::from).filter(|row| *row < self.page_rows)
         else {
             return;
         };
         match self.view {
             View::Fixed | View::Signals | View::Send => {
-                self.selected = views::first_row(self.selected, self.page_rows) + row;
+                self.selected = first_row(self.selected, self.page_rows) + row;
             }
             View::Trace => {
                 let top = self.bottom.saturating_sub(self.page_rows as u64).max(model.history.first());

@@ -3,6 +3,7 @@
 mod column;
 mod device;
 mod entry;
+mod graph;
 mod keys;
 mod line;
 mod prompt;
@@ -16,7 +17,9 @@ use crate::boards::place_of;
 
 pub use column::Column;
 pub use entry::{SendEntry, parse_entry};
+pub use graph::Drawn;
 pub use line::{Prompt, PromptKind};
+pub use scroll::first_row;
 pub use state::{App, Flow, TimeMode, View};
 
 impl App {

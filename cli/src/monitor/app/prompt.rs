@@ -7,7 +7,7 @@ use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
 use super::super::recorder;
-use super::super::source::Order;
+use super::super::order::Order;
 use super::entry::parse_entry;
 use super::line::{Prompt, PromptKind};
 use super::state::{App, Direction};

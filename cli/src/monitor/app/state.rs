@@ -5,10 +5,12 @@ use std::sync::mpsc::Sender;
 use cantap::Id;
 
 use super::super::model::{Model, Seen};
-use super::super::source::{Order, Plan};
+use super::super::order::Order;
+use super::super::plan::Plan;
 use super::super::theme::Theme;
 use super::column::Column;
 use super::entry::SendEntry;
+use super::graph::Graph;
 use super::line::{Line, Prompt, PromptKind};
 
 /// A page of the display.
@@ -48,12 +50,21 @@ impl View {
             Self::Record => "Record",
         }
     }
+
+    /// The page whose tab is in this column of the screen's first line.
+    pub fn at_column(column: u16) -> Option<Self> {
+        let mut end = 1;
+        Self::ALL.into_iter().find(|view| {
+            end += view.title().len() as u16 + 3;
+            column < end
+        })
+    }
 }
 
 /// How times are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TimeMode {
-    /// Seconds since the epoch, as candump -ta.
+    /// The time of day, UTC.
     Absolute,
     /// Seconds since the first record.
     Relative,
@@ -105,10 +116,8 @@ pub struct App {
     pub signal_order: Vec<usize>,
     /// Rows of the page that fit, as last drawn.
     pub page_rows: usize,
-    /// Seconds that the graph shows.
-    pub graph_span: f64,
-    /// The graph's cursor, as a share of its width.
-    pub graph_cursor: Option<f64>,
+    /// What the graph shows of the time.
+    pub graph: Graph,
     /// Frames to send.
     pub send: Vec<SendEntry>,
     /// The help is shown.
@@ -175,8 +184,7 @@ impl App {
             fixed_order: Vec::new(),
             signal_order: Vec::new(),
             page_rows: 20,
-            graph_span: 10.0,
-            graph_cursor: None,
+            graph: Graph::default(),
             send: Vec::new(),
             help: false,
             prompt: None,

@@ -137,6 +137,11 @@ impl History {
             .and_then(|kept| self.whole(kept))
     }
 
+    /// All records there are, listed or not, the oldest first.
+    pub fn all(&self) -> impl Iterator<Item = TraceRecord> + use<'_> {
+        self.records.iter().filter_map(|kept| self.whole(kept))
+    }
+
     /// Records there are, listed or not.
     pub fn len(&self) -> usize {
         self.records.len()

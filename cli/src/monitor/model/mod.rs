@@ -4,6 +4,7 @@
 pub mod fixed;
 pub mod history;
 mod kept;
+pub mod series;
 pub mod signals;
 
 use std::collections::VecDeque;
@@ -16,12 +17,13 @@ use cantap::wire::message::Status;
 use cantap_analysis::stats::{Options, Statistics, Window};
 use cantap_signals::Decoder;
 
-use super::source::Plan;
+use super::plan::Plan;
 use crate::hearing::Hearing;
 
 pub use fixed::{FixedTable, Row};
 pub use history::History;
-pub use signals::{Sample, SignalRow, SignalTable};
+pub use series::{Column, Point, Series};
+pub use signals::{SignalRow, SignalTable};
 
 /// Windows of the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
@@ -145,7 +147,7 @@ impl Model {
         let options = Options { window: LOAD_WINDOW, ..options };
         let seen = Seen {
             table: FixedTable::default(),
-            signals: SignalTable::new(decoder),
+            signals: SignalTable::new(decoder, history_bytes),
             statistics: Statistics::new(options.clone())?,
             loads: Vec::new(),
             devices: Vec::new(),

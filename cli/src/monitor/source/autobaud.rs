@@ -8,7 +8,8 @@ use cantap::device::channel_number;
 use cantap::wire::message::Mode;
 
 use super::super::model::SourceState;
-use super::{Plan, Source, Then, lock};
+use super::super::plan::Plan;
+use super::{Source, Then, lock};
 use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 

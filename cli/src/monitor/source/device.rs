@@ -9,7 +9,9 @@ use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
 use cantap::{Frame, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
-use super::{FIGURES_EVERY, Order, Plan, Source, Then, WAIT, lock};
+use super::super::order::Order;
+use super::super::plan::Plan;
+use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use crate::advice;
 use crate::boards::place_of;
 use crate::hearing::Hearing;

@@ -11,7 +11,9 @@ use cantap_formats::{OpenError, ReadOptions, TraceReader, open_reader};
 use cantap_trace::playback::{Due, Playback};
 
 use super::super::model::SourceState;
-use super::{FIGURES_EVERY, Order, Source, Then, WAIT, lock};
+use super::super::order::Order;
+use super::super::plan::Plan;
+use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use crate::advice;
 
 /// Records handed over under one lock.
@@ -134,7 +136,7 @@ impl Source<'_> {
         }
     }
 
-    fn leave_file(&mut self, plan: super::Plan) {
+    fn leave_file(&mut self, plan: Plan) {
         let mut model = lock(self.model);
         model.unread = None;
         model.first_ns = None;

@@ -9,7 +9,7 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, Mo
 
 use super::super::app::{App, View};
 use super::super::model::{Model, Recording, SourceState};
-use super::super::source::Order;
+use super::super::order::Order;
 use super::super::views;
 use super::{app, device, frame, model};
 

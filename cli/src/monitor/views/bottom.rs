@@ -128,7 +128,7 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         View::Trace => "t time  / search  n N next  y copy  ↑↓ scroll  End newest  f filter",
         View::Fixed => "s S sort  g group  # * notch  H heat  x u hide  o colour  f filter",
         View::Signals => "↑↓ select  Enter into the graph",
-        View::Graph => "+ - zoom  ← → cursor  Esc no cursor",
+        View::Graph => "+ - zoom  ← → pan  x cursors  a all  s steps or lines  End follow",
         View::Statistics => "b bit rate  A find it  D device  m mode",
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",

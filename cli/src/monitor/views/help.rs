@@ -7,7 +7,7 @@ use ratatui::widgets::{Block, Clear, Paragraph};
 
 use super::super::theme::Theme;
 
-const KEYS: [(&str, &str); 19] = [
+const KEYS: &[(&str, &str)] = &[
     ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send, record"),
     ("q, Ctrl-C", "leave"),
     ("Space", "stop the display, go on; send: the entry on or off"),
@@ -21,7 +21,9 @@ const KEYS: [(&str, &str); 19] = [
     ("#  *  H", "fixed: hide what changes anyway, show it again, heat of bits"),
     ("x  u  o", "fixed: hide the row, show all, colour the row"),
     ("Enter", "signals: into the graph; send: send once"),
-    ("+ -, arrows", "graph: zoom, cursor"),
+    ("+ -  ↑ ↓ wheel", "graph: zoom, around the cursor or the mouse"),
+    ("← → PgUp PgDn", "graph: move the cursor, or pan; Home is the oldest, End follows"),
+    ("x  a  s  Esc", "graph: cursors A and B, show all, steps or lines, no cursors"),
     ("a  e  d", "send: add, edit, delete"),
     ("m", "listen-only or normal"),
     ("r", "start or stop recording"),

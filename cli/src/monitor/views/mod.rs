@@ -23,8 +23,6 @@ use super::app::{App, View};
 use super::model::Model;
 use super::theme::Theme;
 
-pub use list::first_row;
-
 /// The smallest screen that anything fits on.
 pub const LEAST: (u16, u16) = (40, 8);
 
@@ -74,6 +72,9 @@ fn make_ascii(buffer: &mut Buffer) {
             symbol if symbol.is_ascii() => continue,
             "─" | "–" => "-",
             "│" => "|",
+            "Δ" => "d",
+            "┤" => "+",
+            "╵" => "|",
             "┌" | "┐" | "└" | "┘" => "+",
             "▸" | "→" => ">",
             "←" => "<",
@@ -97,13 +98,4 @@ fn tabs(app: &App) -> Line<'static> {
         spans.push(Span::styled(text, style));
     }
     Line::from(spans)
-}
-
-/// The page whose tab is in this column.
-pub fn tab_at(column: u16) -> Option<View> {
-    let mut end = 1;
-    View::ALL.into_iter().find(|view| {
-        end += view.title().len() as u16 + 3;
-        column < end
-    })
 }

@@ -56,7 +56,7 @@ fn line(row: &SignalRow, name_columns: usize, app: &App, seen: &Seen) -> Line<'s
     let name: String = name.chars().take(name_columns).collect();
     let value = seen.signals.short_text(row, 21);
     Line::from(vec![
-        Span::raw(if row.chosen { "* " } else { "  " }),
+        Span::raw(if row.series.is_some() { "* " } else { "  " }),
         Span::raw(format!("{} {name:<name_columns$} ", row.channel)),
         Span::styled(format!("{value:>21}{arrow}"), style),
         Span::styled(format!(" {:>10} {:>10} ", short(row.min), short(row.max)), theme.label()),
@@ -87,8 +87,8 @@ fn spark(row: &SignalRow, now_ns: i64, unicode: bool) -> String {
     let before = |column: usize| now_ns.saturating_sub((SPARK_COLUMNS - 1 - column) as i64 * SPARK_COLUMN_NS);
     let values: Vec<_> = (0..SPARK_COLUMNS)
         .map(|column| {
-            let until = row.samples.partition_point(|sample| sample.time_ns <= before(column));
-            until.checked_sub(1).map(|last| row.samples[last].last)
+            let until = row.recent.partition_point(|(time_ns, _)| *time_ns <= before(column));
+            until.checked_sub(1).map(|last| row.recent[last].1)
         })
         .collect();
     let low = values.iter().flatten().copied().fold(f64::INFINITY, f64::min);

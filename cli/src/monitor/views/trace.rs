@@ -14,6 +14,7 @@ use super::super::app::{App, TimeMode};
 use super::super::event_text::{event_text, hex, lost, printable};
 use super::super::model::Model;
 use super::super::theme::Theme;
+use super::super::times::{clock, seconds};
 use super::list::bytes;
 
 /// Draws the page.
@@ -62,29 +63,21 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
 
 fn time_heading(mode: TimeMode) -> &'static str {
     match mode {
-        TimeMode::Absolute => "Time (s, UTC)",
+        TimeMode::Absolute => "Time (UTC)",
         TimeMode::Relative => "Time (s)",
         TimeMode::Delta => "Delta (s)",
     }
 }
 
-/// A time in seconds with six decimals.
-pub fn seconds(ns: i64) -> String {
-    let sign = if ns < 0 { "-" } else { "" };
-    let us = ns.unsigned_abs() / 1000;
-    format!("{sign}{}.{:06}", us / 1_000_000, us % 1_000_000)
-}
-
 fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &Model) -> Line<'static> {
     let theme = app.theme;
+    let since = |ns: i64| seconds(record.time_ns.saturating_sub(ns));
     let time = match app.time_mode {
-        TimeMode::Absolute => record.time_ns,
-        TimeMode::Relative => record.time_ns.saturating_sub(model.first_ns.unwrap_or(0)),
-        TimeMode::Delta => {
-            record.time_ns.saturating_sub(before.map_or(record.time_ns, |before| before.time_ns))
-        }
+        TimeMode::Absolute => clock(record.time_ns, 6),
+        TimeMode::Relative => since(model.first_ns.unwrap_or(0)),
+        TimeMode::Delta => since(before.map_or(record.time_ns, |before| before.time_ns)),
     };
-    let start = format!("{:>17} {} ", seconds(time), record.channel);
+    let start = format!("{time:>17} {} ", record.channel);
     let TraceEvent::Frame { frame, direction, late } = record.event else {
         let text = format!("{start}{}", event_text(&record.event));
         return Line::styled(text, event_style(&record.event, theme));
@@ -119,11 +112,4 @@ fn event_style(event: &TraceEvent, theme: Theme) -> Style {
         TraceEvent::State { state: ErrorState::Active, .. } => theme.label(),
         _ => theme.error(),
     }
-}
-
-/// The record as candump writes it.
-pub fn candump_line(model: &Model, number: u64) -> Option<String> {
-    let record = model.history.get(number)?;
-    let frame = record.frame()?;
-    Some(format!("({}) {} {frame}", seconds(record.time_ns), cantap_trace::Interface(record.channel)))
 }

@@ -3,6 +3,7 @@
 use std::borrow::Borrow;
 use std::fmt;
 use std::ops::Deref;
+use std::path::Path;
 use std::str::FromStr;
 
 use anyhow::Context;
@@ -111,6 +112,21 @@ impl Address {
         text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")
     }
 
+    /// Whether what stands where a trace or a device can stand is meant for a device: one that needs no port, or a serial port. What
+    /// is there as a file is one.
+    pub fn is_meant_by(path: &Path) -> bool {
+        if let Ok(there) = path.metadata() {
+            return is_port(&there);
+        }
+        let text = path.to_str().unwrap_or_default();
+        let is_com = |text: &str| {
+            let digits = text.strip_prefix("COM");
+            digits
+                .is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
+        };
+        Self::is_no_port(text) || text.starts_with("/dev/") || is_com(text)
+    }
+
     /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
     pub fn is_car(&self) -> bool {
         matches!(&self.place, Place::Virtual(options) if options.car)
@@ -155,6 +171,17 @@ impl Address {
         };
         Ok(OpenDevice { device, bitrates })
     }
+}
+
+#[cfg(unix)]
+fn is_port(there: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::FileTypeExt;
+    there.file_type().is_char_device()
+}
+
+#[cfg(not(unix))]
+fn is_port(_: &std::fs::Metadata) -> bool {
+    false
 }
 
 impl PartialEq for Address {
@@ -210,6 +237,28 @@ mod tests {
         for text in ["", "emu", "emu:", "tcp:1.2.3.4", "virtual:speed=9"] {
             assert!(text.parse::<Address>().is_err(), "{text}");
         }
+    }
+
+    #[test]
+    fn what_stands_where_a_trace_can_stand_may_be_a_device() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("virtual");
+        std::fs::write(&file, "").unwrap();
+        assert!(!Address::is_meant_by(&file));
+        for (text, is_device) in [
+            ("virtual", true),
+            ("virtual:car", true),
+            ("emu:a.elf", true),
+            ("COM5", true),
+            ("/dev/ttyACM17", true),
+            ("drive.log", false),
+            ("COMmon.log", false),
+            ("-", false),
+        ] {
+            assert_eq!(Address::is_meant_by(Path::new(text)), is_device, "{text}");
+        }
+        #[cfg(unix)]
+        assert!(Address::is_meant_by(Path::new("/dev/null")));
     }
 
     #[cfg(feature = "emu")]

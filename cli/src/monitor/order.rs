@@ -28,6 +28,10 @@ pub enum Order {
     Step,
     /// Playback: loop or not.
     ToggleLoop,
+    /// Playback: to the first record that is no older than this, in nanoseconds as in a record.
+    Seek(i64),
+    /// Bring the channels that are bus-off back onto the bus.
+    Recover,
     /// Find the bit rates of the device's channels, only listening; stop doing so.
     Autobaud,
     /// Another device, other bit rates, another mode.

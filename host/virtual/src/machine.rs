@@ -16,6 +16,7 @@ use heapless::String;
 use super::board::{
     Ending, FRAME_NS, Filters, ModelClock, TICK_PHASE_NS, VirtualBoard, VirtualChip, VirtualPort,
 };
+use super::car;
 use super::controller::{ControlSide, Controller, TrafficSide};
 use super::flash::Flash;
 use super::options::Options;
@@ -60,6 +61,7 @@ pub struct World {
     witness: Arc<Witness>,
     flash: Flash,
     serial: String<24>,
+    name: &'static str,
     crystal_ppm: f64,
     now_ns: u64,
 }
@@ -76,6 +78,7 @@ impl World {
             flash: Flash::new(options.settings.clone()),
             // Cannot fail: longer ones are refused.
             serial: String::try_from(options.serial.as_str()).unwrap_or_default(),
+            name: if options.car { car::BOARD } else { "virtual" },
             crystal_ppm: options.crystal_ppm,
             now_ns: 0,
         }
@@ -95,6 +98,7 @@ pub struct Machine<'q> {
     joined: bool,
     witness: Arc<Witness>,
     serial: String<24>,
+    name: &'static str,
     crystal_ppm: f64,
     /// What it told of earlier firmwares' controllers.
     heard_before: Heard,
@@ -106,10 +110,10 @@ pub struct Machine<'q> {
 impl<'q> Machine<'q> {
     /// The firmware starts, with an empty queue and nothing open.
     pub fn power_up(queue: &'q RecordQueue, world: World) -> Self {
-        let World { port, buses, loops, joined, witness, flash, serial, crystal_ppm, now_ns } = world;
+        let World { port, buses, loops, joined, witness, flash, serial, name, crystal_ppm, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
         let (producer, consumer) = queue.split();
-        let identity = Identity { board: "virtual", serial: serial.clone() };
+        let identity = Identity { board: name, serial: serial.clone() };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {
             board: VirtualBoard {
@@ -129,6 +133,7 @@ impl<'q> Machine<'q> {
             heard_before: witness.heard(),
             witness,
             serial,
+            name,
             crystal_ppm,
             now_ns,
             next_usb_ns: now_ns,
@@ -138,10 +143,21 @@ impl<'q> Machine<'q> {
 
     /// The firmware is gone; buses, port and flash remain.
     pub fn power_down(self) -> World {
-        let Self { board, port, buses, loops, joined, witness, serial, crystal_ppm, now_ns, .. } = self;
+        let Self { board, port, buses, loops, joined, witness, serial, name, crystal_ppm, now_ns, .. } = self;
         // What it had not read is lost with it.
         while port.from_host.take(&mut [0; 64]) > 0 {}
-        World { port, buses, loops, joined, witness, flash: board.chip.flash, serial, crystal_ppm, now_ns }
+        World {
+            port,
+            buses,
+            loops,
+            joined,
+            witness,
+            flash: board.chip.flash,
+            serial,
+            name,
+            crystal_ppm,
+            now_ns,
+        }
     }
 
     /// Hangs the device on a USB host whose time is so far ahead of model time: its frames are whole milliseconds of it.

@@ -54,6 +54,16 @@ impl SignalRow {
     }
 }
 
+/// A signal in a frame, in words.
+pub struct Decoded {
+    /// What the signal is called.
+    pub name: String,
+    /// Its value with text and unit.
+    pub text: String,
+    /// The alarm that it raises.
+    pub alarm: Option<Alarm>,
+}
+
 /// All signals seen, in order of appearance.
 #[derive(Clone)]
 pub struct SignalTable {
@@ -81,6 +91,17 @@ impl SignalTable {
             decided: HashMap::new(),
             room: room.max(LEAST_ROOM),
         }
+    }
+
+    /// Decodes by other databases from now on. Nothing is seen yet; of what was in the graph, signals of the same name will be.
+    pub fn set_decoder(&mut self, decoder: Arc<Decoder>) {
+        let graphed = self.rows.iter().filter(|row| row.series.is_some());
+        let names = graphed.map(|row| format!("{}.{}", self.message_name(row), self.signal(row).name));
+        let names: Vec<_> = names.map(|name| glob_escaped(&name)).collect();
+        self.decoder = decoder;
+        self.clear();
+        self.decided.clear();
+        self.chosen.extend(names.iter().filter_map(|name| Selection::new(&[name]).ok()));
     }
 
     /// Takes a record.
@@ -191,11 +212,6 @@ impl SignalTable {
         &self.rows
     }
 
-    /// The row of a signal on a channel.
-    pub fn row(&self, channel: u8, message: MessageRef, signal: u32) -> Option<&SignalRow> {
-        self.places.get(&(channel, message, signal)).map(|place| &self.rows[*place])
-    }
-
     /// Signals that a pattern matches, such as `Speed` or `Engine.*`, go into the graph when they are first seen. Fails if no signal
     /// of the databases does.
     pub fn choose(&mut self, pattern: &str) -> Result<(), SelectionError> {
@@ -241,6 +257,11 @@ impl SignalTable {
         &self.decoder.message(row.message).name
     }
 
+    /// `Message.Signal`, by which signals are looked for.
+    pub fn full_name(&self, row: &SignalRow) -> String {
+        format!("{}.{}", self.message_name(row), self.signal(row).label())
+    }
+
     /// The message that a frame is, by name.
     pub fn name_of(&self, record: &TraceRecord) -> Option<&str> {
         let message = self.decoder.find(record.channel, record.frame()?.id())?;
@@ -249,15 +270,37 @@ impl SignalTable {
 
     /// The value with its text and unit.
     pub fn text(&self, row: &SignalRow) -> String {
-        let signal = self.signal(row);
-        if let Some(indicator) = self.decoder.message(row.message).indicator(signal, row.raw) {
-            return signal.text(row.raw).unwrap_or(indicator.name()).to_owned();
+        self.raw_text(row.message, row.signal, row.raw)
+    }
+
+    fn raw_text(&self, message: MessageRef, signal: u32, raw: u64) -> String {
+        let message = self.decoder.message(message);
+        let signal = &message.signals[signal as usize];
+        if let Some(indicator) = message.indicator(signal, raw) {
+            return signal.text(raw).unwrap_or(indicator.name()).to_owned();
         }
-        let number = signal.number(row.raw).for_people();
-        match signal.text(row.raw) {
+        let number = signal.number(raw).for_people();
+        match signal.text(raw) {
             Some(text) => format!("{number} ({text})"),
             None => format!("{number} {}", signal.unit).trim_end().to_owned(),
         }
+    }
+
+    /// What is in a frame, signal by signal.
+    pub fn in_frame(&self, channel: u8, frame: &TraceFrame) -> Vec<Decoded> {
+        let mut values = Vec::new();
+        let Some(message) = self.decoder.decode(channel, frame, &mut values) else {
+            return Vec::new();
+        };
+        let decoded = values.iter().map(|value| {
+            let signal = &self.decoder.message(message).signals[value.signal as usize];
+            Decoded {
+                name: signal.label().into_owned(),
+                text: self.raw_text(message, value.signal, value.raw),
+                alarm: signal.alarms.check(value.value),
+            }
+        });
+        decoded.collect()
     }
 
     /// As [`Self::text`] in so many columns: digits go before the unit does.
@@ -300,6 +343,15 @@ impl SignalTable {
         }
         self.places.clear();
     }
+}
+
+/// A name as the pattern that matches nothing else.
+fn glob_escaped(name: &str) -> String {
+    let escape = |character: char| match character {
+        '*' | '?' | '[' => format!("[{character}]"),
+        other => other.to_string(),
+    };
+    name.chars().map(escape).collect()
 }
 
 /// Keeps the last value of each step of time.

@@ -6,7 +6,8 @@ use std::time::{Duration, Instant};
 
 use cantap::device::{Happening, Return, UtcClock, channel_number};
 use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
-use cantap::{Frame, TraceEvent, TraceRecord};
+use cantap::wire::record::ErrorState;
+use cantap::{Channel, Frame, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
 use super::super::order::Order;
@@ -197,6 +198,7 @@ impl Source<'_> {
         };
         model.source = SourceState::Running;
         model.sessions[board] += 1;
+        model.met_car |= hello.board == cantap_virtual::car::BOARD;
         let rates =
             opened.iter().map(|(number, config, clock_hz)| (*number, config.timing.bitrate_bps(*clock_hz)));
         let rates: Vec<_> = rates.collect();
@@ -225,6 +227,10 @@ impl Source<'_> {
 
     /// An order, where there is a device to send with.
     fn follow_with(&mut self, lines: &Lines, order: Order) -> Then {
+        if matches!(order, Order::Recover) && lines.devices().next().is_some() {
+            self.recover(lines);
+            return Then::GoOn;
+        }
         let (Order::Send(number, _) | Order::SetPeriodic(number, ..)) = order else {
             return self.follow(order);
         };
@@ -249,6 +255,34 @@ impl Source<'_> {
             }
             order => self.follow(order),
         }
+    }
+
+    /// Brings the channels that are bus-off back onto their buses.
+    fn recover(&self, lines: &Lines) {
+        let mut said = Vec::new();
+        for (board, device) in lines.devices() {
+            let status = match device.status() {
+                Ok(status) => status,
+                Err(error) => {
+                    said.push(advice::told(&error));
+                    continue;
+                }
+            };
+            for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
+                if state.open.is_none() || state.state != ErrorState::BusOff {
+                    continue;
+                }
+                let number = channel_number(board, channel);
+                said.push(match device.recover(channel) {
+                    Ok(()) => format!("channel {number} comes back onto its bus"),
+                    Err(error) => format!("channel {number}: {}", advice::told(&error)),
+                });
+            }
+        }
+        if said.is_empty() {
+            said.push("no channel is bus-off".to_owned());
+        }
+        self.notice(said.join("; "));
     }
 
     /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure

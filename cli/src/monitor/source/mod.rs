@@ -130,7 +130,13 @@ impl Source<'_> {
                 self.notice("there is no device to send with; open one with D");
                 lock(self.model).refused.push((channel, slot));
             }
-            Order::Faster | Order::Slower | Order::TogglePause | Order::Step | Order::ToggleLoop => {
+            Order::Recover => self.notice("there is no device to bring back onto a bus"),
+            Order::Faster
+            | Order::Slower
+            | Order::TogglePause
+            | Order::Step
+            | Order::ToggleLoop
+            | Order::Seek(_) => {
                 self.notice("only a file can be played slower, faster or in steps");
             }
         }

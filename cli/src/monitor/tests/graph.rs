@@ -143,8 +143,13 @@ fn nothing_is_drawn_across_a_loss_nor_after_the_last_value() {
     ]);
     let (mut app, _orders) = app(View::Graph);
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
-    let line: Vec<char> =
-        screen.lines().skip(3).find(|line| line.chars().skip(12).any(|c| c != ' ')).unwrap().chars().collect();
+    let line: Vec<char> = screen
+        .lines()
+        .skip(3)
+        .find(|line| line.chars().skip(12).any(|c| c != ' '))
+        .unwrap()
+        .chars()
+        .collect();
     let is_drawn = |second: usize| line.get(10 + second * 9 + 4).is_some_and(|character| *character != ' ');
     let drawn: Vec<_> = (0..10).filter(|second| is_drawn(*second)).collect();
     assert_eq!(drawn, [0, 1, 6], "{screen}");
@@ -153,7 +158,9 @@ fn nothing_is_drawn_across_a_loss_nor_after_the_last_value() {
 #[test]
 fn a_signal_that_is_chosen_late_has_its_past_and_what_fell_out_is_told() {
     let mut model = model(1_000_000);
-    model.take(&(0..20_000).map(|n| sample(n * MS, (n / 100) as u8, (n / 1000 % 2) as u8)).collect::<Vec<_>>());
+    model.take(
+        &(0..20_000).map(|n| sample(n * MS, (n / 100) as u8, (n / 1000 % 2) as u8)).collect::<Vec<_>>(),
+    );
     let (mut app, _orders) = app(View::Signals);
     screen_text(&mut app, &model, (100, 24)).unwrap();
     keys(&mut app, &mut model, &[KeyCode::Down, KeyCode::Enter]);

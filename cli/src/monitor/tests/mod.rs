@@ -5,7 +5,9 @@
 
 mod colours;
 mod graph;
+mod help;
 mod keys;
+mod pages;
 mod random;
 
 use std::path::{Path, PathBuf};

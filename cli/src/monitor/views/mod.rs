@@ -42,7 +42,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     ])
     .areas(area);
     frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
-    frame.render_widget(Paragraph::new(state::line(app, model)), state);
+    state::draw(frame, state, app, model);
     // While the display is stopped, the pages show what was seen then.
     let frozen = app.frozen.take();
     let seen = frozen.as_deref().unwrap_or(&model.seen);
@@ -58,7 +58,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     app.frozen = frozen;
     bottom::draw(frame, body, bottom, app, model);
     if app.help {
-        help::draw(frame, area);
+        help::draw(frame, area, app);
     }
     if !app.theme.unicode {
         make_ascii(frame.buffer_mut());
@@ -71,11 +71,12 @@ fn make_ascii(buffer: &mut Buffer) {
         let plain = match cell.symbol() {
             symbol if symbol.is_ascii() => continue,
             "─" | "–" => "-",
-            "│" => "|",
+            "━" => "=",
+            "●" => "o",
+            "◆" => "B",
+            "│" | "╵" => "|",
             "Δ" => "d",
-            "┤" => "+",
-            "╵" => "|",
-            "┌" | "┐" | "└" | "┘" => "+",
+            "┤" | "┌" | "┐" | "└" | "┘" => "+",
             "▸" | "→" => ">",
             "←" => "<",
             "↑" => "^",
@@ -96,6 +97,10 @@ fn tabs(app: &App) -> Line<'static> {
         let text = format!("{}{}{} ", index + 1, if view == app.view { '▸' } else { ' ' }, view.title());
         let style = if view == app.view { Theme::heading() } else { Style::new() };
         spans.push(Span::styled(text, style));
+    }
+    let (this, all) = app.beside;
+    if all > 1 {
+        spans.push(Span::styled(format!("w {this} of {all}"), Theme::heading()));
     }
     Line::from(spans)
 }

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use cantap::wire::record::ErrorState;
 use cantap::{TraceEvent, TraceRecord};
 use ratatui::Frame;
-use ratatui::layout::Rect;
+use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
@@ -16,10 +16,15 @@ use super::super::model::Model;
 use super::super::theme::Theme;
 use super::super::times::{clock, seconds};
 use super::list::bytes;
+use super::signals::{alarm, in_line};
+
+/// Where a frame's signals have room beside the data.
+const LEAST_WITH_SIGNALS: u16 = 120;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let history = &model.history;
+    let area = if app.record_opened { opened(frame, area, app, model) } else { area };
     let rows = usize::from(area.height).saturating_sub(1) as u64;
     app.page_rows = rows as usize;
     let (first, end) = (history.first(), history.end());
@@ -55,10 +60,47 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             continue;
         };
         let before = number.checked_sub(1).and_then(|number| history.get(number));
-        let line = line(&record, before.as_ref(), app, model);
+        let mut line = line(&record, before.as_ref(), app, model);
+        if area.width >= LEAST_WITH_SIGNALS
+            && let Some(frame) = record.frame()
+        {
+            line.spans.extend(in_line(&model.seen.signals.in_frame(record.channel, frame), app.theme));
+        }
         lines.push(if app.cursor == Some(number) { line.style(Theme::bar()) } else { line });
     }
     frame.render_widget(Paragraph::new(lines), area);
+}
+
+/// The signals of the selected record, or of the newest, below the page; returns what is left of it.
+fn opened(frame: &mut Frame<'_>, area: Rect, app: &App, model: &Model) -> Rect {
+    let place = app.cursor.or(model.history.end().checked_sub(1));
+    let record = place.and_then(|place| model.history.get(place));
+    let of_frame = record.and_then(|record| Some((record, *record.frame()?)));
+    let mut lines = vec![
+        match (&of_frame, record) {
+            (Some((record, frame)), _) => {
+                let name = model.seen.signals.name_of(record).unwrap_or("in no database");
+                Line::from(format!("{} {}  {name}", record.channel, frame.id()))
+            }
+            (None, Some(record)) => Line::from(event_text(&record.event)),
+            (None, None) => Line::from("nothing is selected"),
+        }
+        .style(Theme::bar()),
+    ];
+    for signal in of_frame
+        .map(|(record, frame)| model.seen.signals.in_frame(record.channel, &frame))
+        .unwrap_or_default()
+    {
+        let (arrow, style) = alarm(signal.alarm, app.theme);
+        lines.push(Line::from(vec![
+            Span::styled(format!("  {:<30} ", signal.name), app.theme.label()),
+            Span::styled(format!("{} {arrow}", signal.text), style),
+        ]));
+    }
+    let height = (lines.len() as u16).min(area.height / 2);
+    let [rest, place] = Layout::vertical([Constraint::Min(1), Constraint::Length(height)]).areas(area);
+    frame.render_widget(Paragraph::new(lines), place);
+    rest
 }
 
 fn time_heading(mode: TimeMode) -> &'static str {

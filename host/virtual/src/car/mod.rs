@@ -31,6 +31,8 @@ use crate::simbus::{Senders, arbitration_field};
 pub const DATABASE: &str = include_str!("car.dbc");
 /// What the database is called where a file's name is expected.
 pub const DATABASE_NAME: &str = "virtual:car";
+/// What the device calls its board, so that whoever meets it at a serial port knows whose signals it has.
+pub const BOARD: &str = "virtual-car";
 /// The buses' bit rates: drive train, body.
 pub const BITRATES_BPS: [u32; 2] = [500_000, 125_000];
 

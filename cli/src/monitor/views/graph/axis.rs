@@ -14,10 +14,10 @@ const VALUE_ROWS: usize = 3;
 
 /// The labels of values, each with its row, of a pane with so many rows.
 pub fn values([low, high]: [f64; 2], rows: u16) -> Vec<(u16, String)> {
-    if rows == 0 || !(high > low) {
+    if rows == 0 || high.total_cmp(&low).is_le() {
         return Vec::new();
     }
-    let wanted = (usize::from(rows) / VALUE_ROWS).clamp(1, 8);
+    let wanted = (usize::from(rows) / VALUE_ROWS).clamp(2, 8);
     let (places, step) = ticks((low, high), wanted);
     let last = f64::from(rows - 1);
     let mut labels: Vec<(u16, String)> = Vec::new();
@@ -68,7 +68,10 @@ mod tests {
     fn times_stand_at_round_times_of_day() {
         let time = Time { from_ns: 1_410_714_882_622_188_000, span_ns: 10 * S, columns: 64 };
         let line = times(time, '|');
-        assert_eq!((line.find("|17:14:45"), line.find("|17:14:50"), line.matches('|').count()), (Some(15), Some(47), 2));
+        assert_eq!(
+            (line.find("|17:14:45"), line.find("|17:14:50"), line.matches('|').count()),
+            (Some(15), Some(47), 2)
+        );
         let time = Time { from_ns: 1_410_714_882_622_188_000, span_ns: S / 100, columns: 64 };
         assert!(times(time, '|').contains("|17:14:42.625"), "{}", times(time, '|'));
         for span_ns in [1, 1000, i64::MAX / 4] {
@@ -82,10 +85,7 @@ mod tests {
 
     #[test]
     fn values_stand_at_round_numbers_and_each_in_a_row_of_its_own() {
-        assert_eq!(
-            values([0.0, 10.0], 9),
-            [(8, "0".to_owned()), (4, "5".to_owned()), (0, "10".to_owned())]
-        );
+        assert_eq!(values([0.0, 10.0], 9), [(8, "0".to_owned()), (4, "5".to_owned()), (0, "10".to_owned())]);
         assert_eq!(values([1.0, 1.0], 9), []);
         assert!(values([0.0, 1e300], 3).len() <= 3);
         assert!(values([-1e-12, 1e-12], 50).iter().all(|(row, text)| *row < 50 && text.chars().count() < 10));

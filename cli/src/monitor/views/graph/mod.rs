@@ -3,6 +3,8 @@
 mod axis;
 mod curve;
 
+use std::fmt::Write as _;
+
 use cantap_signals::Digital;
 use ratatui::Frame;
 use ratatui::layout::{Constraint, Layout, Rect};
@@ -68,8 +70,7 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
         return;
     }
     let mut colours = 0..;
-    let mut with_colour =
-        |(row, series)| Chosen { row, series, colour: colours.next().unwrap_or_default() };
+    let mut with_colour = |(row, series)| Chosen { row, series, colour: colours.next().unwrap_or_default() };
     let mut panes: Vec<(&str, Vec<Chosen<'_>>)> = Vec::new();
     for chosen in analogue.into_iter().map(&mut with_colour) {
         let unit = seen.signals.signal(chosen.row).unit.as_str();
@@ -108,7 +109,8 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
     }
     if let [.., times, said] = areas[..] {
         page.times(frame, times);
-        let is_cut = panes.iter().flat_map(|(_, rows)| rows).chain(&lanes).any(|chosen| chosen.series.is_cut());
+        let is_cut =
+            panes.iter().flat_map(|(_, rows)| rows).chain(&lanes).any(|chosen| chosen.series.is_cut());
         frame.render_widget(Paragraph::new(page.said(oldest, is_cut)), said);
     }
 }
@@ -277,12 +279,13 @@ impl Page<'_> {
         let graph = &self.app.graph;
         let mut text = format!(" {} s", short(graph.span_ns as f64 / 1e9));
         text.push_str(if graph.lines { ", lines" } else { ", steps" });
+        // Writing to a String cannot fail.
         for (name, at) in self.cursors() {
-            text.push_str(&format!("  {name} {}", clock(at, 6)));
+            let _ = write!(text, "  {name} {}", clock(at, 6));
         }
         if let [Some(first), Some(second)] = graph.cursors {
             let between = second.saturating_sub(first) as f64 / 1e9;
-            text.push_str(&format!("  Δt {between:.6} s"));
+            let _ = write!(text, "  Δt {between:.6} s");
         }
         let mut spans = vec![Span::styled(text, theme.label())];
         if graph.end_ns.is_some() {

@@ -127,13 +127,20 @@ pub fn channels_of_one(text: &str) -> Result<Channels, String> {
     Ok(channels)
 }
 
+/// A channel of a trace, which may have more than any device: as `1`, or as an interface, `can0`.
+pub fn channel_of_trace(text: &str) -> Result<u8, String> {
+    let number = match text.strip_prefix("can") {
+        Some(index) => index.parse::<u8>().ok().and_then(|index| index.checked_add(1)),
+        None => text.parse().ok(),
+    };
+    number.ok_or_else(|| {
+        "a trace's channels are 1, 2 and so on up to 255, several as 1,3; can0 is channel 1".to_owned()
+    })
+}
+
 /// The number of a channel, from 1: as `1`, or as the interface that a trace calls it, `can0`.
 fn channel_number(text: &str) -> Option<u8> {
-    let number = match text.strip_prefix("can") {
-        Some(index) => index.parse::<u8>().ok()?.checked_add(1)?,
-        None => text.parse().ok()?,
-    };
-    (1..=MOST_CHANNELS).contains(&number).then_some(number)
+    channel_of_trace(text).ok().filter(|number| (1..=MOST_CHANNELS).contains(number))
 }
 
 /// One channel of a device, as `1`, `2`, or as an interface: `can0` is channel 1, as in every trace.

@@ -4,6 +4,8 @@ use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
 
+use crate::interrupt;
+
 /// A temporary file beside the one that is to be written. It ends like that one, so that it has the same format and compression.
 pub struct Beside {
     /// Where to write.
@@ -22,15 +24,13 @@ impl Beside {
         let path = if path.exists() { path.canonicalize().ok()? } else { path.to_owned() };
         let name = path.file_name()?.to_str()?;
         let temporary = path.with_file_name(format!(".cantap-{}-{name}", std::process::id()));
+        interrupt::unfinished(&temporary);
         let made = fs::File::create(&temporary).and_then(|file| match fs::metadata(&path) {
             Ok(old) => file.set_permissions(old.permissions()),
             Err(_) => Ok(()),
         });
-        if made.is_err() {
-            let _ = fs::remove_file(&temporary);
-            return None;
-        }
-        Some(Self { temporary, path })
+        let beside = Self { temporary, path };
+        made.is_ok().then_some(beside)
     }
 
     /// Puts the whole file where it belongs.
@@ -43,5 +43,14 @@ impl Drop for Beside {
     /// What was not put in place was not finished.
     fn drop(&mut self) {
         let _ = fs::remove_file(&self.temporary);
+        interrupt::finished(&self.temporary);
+    }
+}
+
+/// Writes a file at once: as a whole, or not at all.
+pub fn write(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    match Beside::of(path) {
+        Some(beside) => fs::write(&beside.temporary, bytes).and_then(|()| beside.put_in_place()),
+        None => fs::write(path, bytes),
     }
 }

@@ -9,6 +9,7 @@ use cantap_trace::filter::Filter;
 
 use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
+use crate::missing::Missing;
 
 /// How to read a trace; for commands to flatten into theirs.
 #[derive(clap::Args)]
@@ -99,6 +100,14 @@ impl Records {
             }
     }
 
+    /// Whether more may come after what is there now.
+    pub const fn grows(&self) -> bool {
+        match &self.source {
+            Source::File(_, grows) => *grows,
+            Source::Device(_) => true,
+        }
+    }
+
     /// Ends a file that grows as soon as this is true; says whether it is one.
     pub fn end_when(&mut self, stop: fn() -> bool) -> bool {
         match &mut self.source {
@@ -110,30 +119,12 @@ impl Records {
         }
     }
 
-    /// How many places of a file could not be read so far.
-    pub fn issues(&self) -> u64 {
-        match &self.source {
-            Source::File(reader, _) => reader.issues(),
-            Source::Device(_) => 0,
-        }
-    }
-
-    /// What of a file is no part of a CAN trace so far, by kind.
-    pub fn left_out(&self) -> LeftOut {
-        match &self.source {
-            Source::File(reader, _) => reader.left_out().clone(),
-            Source::Device(_) => LeftOut::default(),
-        }
-    }
-
     /// What is not in the records that were read.
     pub fn missing(&self) -> Missing {
-        let (issues, left_out) = (self.issues(), self.left_out());
-        let entries = match &self.source {
-            Source::File(reader, _) => reader.records(),
-            Source::Device(_) => 0,
-        };
-        Missing { issues, left_out, entries }
+        match &self.source {
+            Source::File(reader, _) => Missing::of(reader),
+            Source::Device(_) => Missing::default(),
+        }
     }
 
     /// What else there is to know about a file so far, and how often.
@@ -172,48 +163,6 @@ impl Records {
     }
 }
 
-/// What is not in the records of a file.
-#[derive(Default)]
-pub struct Missing {
-    /// Places that could not be read.
-    pub issues: u64,
-    /// What is no part of a CAN trace, by kind.
-    pub left_out: LeftOut,
-    /// Records that were read.
-    pub entries: u64,
-}
-
-impl Missing {
-    /// The share of the file's entries that is missing, in per cent; an issue counts as one.
-    pub fn share_pct(&self) -> f64 {
-        let missing = self.issues + self.left_out.total();
-        missing as f64 * 100.0 / (self.entries + missing).max(1) as f64
-    }
-
-    /// Counts by kind.
-    pub fn by_kind(&self) -> serde_json::Map<String, serde_json::Value> {
-        self.left_out.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
-    }
-
-    /// What is missing, in words; `None` if nothing is.
-    pub fn in_words(&self) -> Option<String> {
-        let places = match self.issues {
-            0 => None,
-            1 => Some("1 place could not be read".to_owned()),
-            issues => Some(format!("{issues} places could not be read")),
-        };
-        let kinds: Vec<_> = self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
-        let kinds = (!kinds.is_empty()).then(|| format!("no part of a CAN trace: {}", kinds.join(", ")));
-        let all: Vec<_> = places.into_iter().chain(kinds).collect();
-        let few = if self.share_pct() < 0.05 {
-            "less than 0.1".to_owned()
-        } else {
-            format!("{:.1}", self.share_pct())
-        };
-        (!all.is_empty()).then(|| format!("{}; {few} % of the file left out", all.join("; ")))
-    }
-}
-
 /// The next records; says what is wrong on the way, and at the end how often that was.
 fn batch_of_file(
     reader: &mut TraceReader,
@@ -235,9 +184,7 @@ fn batch_of_file(
     for (what, count) in reader.notes().iter() {
         eprintln!("cantap: note: {what} ({count})");
     }
-    let missing =
-        Missing { issues: reader.issues(), left_out: reader.left_out().clone(), entries: reader.records() };
-    if let Some(words) = missing.in_words() {
+    if let Some(words) = Missing::of(reader).in_words() {
         eprintln!("cantap: {words}");
     }
     Ok(false)

@@ -1,6 +1,8 @@
-//! Ctrl-C as a flag: a command that runs until it is stopped ends cleanly, with its summary.
+//! Ctrl-C as a flag: a command that runs until it is stopped ends cleanly, with its summary. Any other command ends at once, and
+//! leaves no half-written file behind.
 
-use std::sync::{Mutex, OnceLock, PoisonError};
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 /// What shells report for a program that Ctrl-C ended.
@@ -9,16 +11,29 @@ const ENDED_BY_SIGNAL: i32 = 130;
 /// whole group, it among them.
 const ECHO: Duration = Duration::from_secs(2);
 
-static REQUEST: OnceLock<Mutex<Request>> = OnceLock::new();
+static HANDLER: OnceLock<()> = OnceLock::new();
+static STATE: Mutex<State> =
+    Mutex::new(State { is_watched: false, request: Request::NONE, unfinished: Vec::new() });
+
+/// What a signal finds.
+struct State {
+    /// Whether the command looks for the flag.
+    is_watched: bool,
+    request: Request,
+    /// Files that are worth nothing yet.
+    unfinished: Vec<PathBuf>,
+}
 
 /// Signals that came.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Request {
     first_at: Option<Instant>,
     signals: u32,
 }
 
 impl Request {
+    const NONE: Self = Self { first_at: None, signals: 0 };
+
     /// Takes the next signal; returns whether to end at once.
     fn signal(&mut self, now: Instant) -> bool {
         self.signals += 1;
@@ -27,26 +42,48 @@ impl Request {
     }
 }
 
+fn state() -> MutexGuard<'static, State> {
+    STATE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn handle() -> Result<(), ctrlc::Error> {
+    if HANDLER.set(()).is_err() {
+        return Ok(());
+    }
+    ctrlc::set_handler(|| {
+        let mut state = state();
+        if state.request.signal(Instant::now()) || !state.is_watched {
+            for path in state.unfinished.drain(..) {
+                let _ = std::fs::remove_file(path);
+            }
+            std::process::exit(ENDED_BY_SIGNAL);
+        }
+    })
+}
+
 /// From now on Ctrl-C (and the system's polite request to end) sets a flag instead of ending the program. Only a third one, or
 /// one that comes [`ECHO`] after the first, ends it at once.
 pub fn watch() -> anyhow::Result<()> {
-    if REQUEST.get().is_some() {
-        return Ok(());
-    }
-    let request = REQUEST.get_or_init(Mutex::default);
-    ctrlc::set_handler(move || {
-        if request.lock().unwrap_or_else(PoisonError::into_inner).signal(Instant::now()) {
-            std::process::exit(ENDED_BY_SIGNAL);
-        }
-    })?;
+    handle()?;
+    state().is_watched = true;
     Ok(())
 }
 
 /// Whether it was pressed.
 pub fn requested() -> bool {
-    REQUEST
-        .get()
-        .is_some_and(|request| request.lock().unwrap_or_else(PoisonError::into_inner).first_at.is_some())
+    state().request.first_at.is_some()
+}
+
+/// A file to remove if a signal ends the program.
+pub fn unfinished(path: &Path) {
+    // Without a handler the file stays, which is untidy and no loss.
+    let _ = handle();
+    state().unfinished.push(path.to_owned());
+}
+
+/// The file is to stay, or is gone.
+pub fn finished(path: &Path) {
+    state().unfinished.retain(|unfinished| unfinished != path);
 }
 
 #[cfg(test)]
@@ -57,7 +94,7 @@ mod tests {
     fn an_echo_changes_nothing_and_insisting_ends_at_once() {
         let start = Instant::now();
         let after = |times_ms: &[u64]| {
-            let mut request = Request::default();
+            let mut request = Request::NONE;
             times_ms.iter().map(|ms| request.signal(start + Duration::from_millis(*ms))).collect::<Vec<_>>()
         };
         assert_eq!(after(&[0, 0]), [false, false]);

@@ -30,19 +30,24 @@ mod channel_bitrate;
 mod clock;
 mod commands;
 mod databases;
+mod exit;
 mod hearing;
 mod input;
 mod interrupt;
 mod live;
 mod losses;
 mod meter;
+mod missing;
 mod monitor;
 mod progress;
 mod rescue;
 mod sending;
 mod stderr;
 mod timing_args;
+mod trace_output;
 mod trigger_args;
+#[cfg(test)]
+mod vocabulary;
 mod words;
 mod wrong;
 
@@ -50,16 +55,6 @@ use std::error::Error;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
-
-/// Exit codes beside 0 (success). Documented in `cantap --help`.
-mod exit {
-    /// Something failed; the message on stderr says what and what to do next.
-    pub const FAILURE: u8 = 1;
-    /// A wrong command line; clap uses it by itself.
-    pub const WRONG_COMMAND_LINE: u8 = 2;
-    /// A check did not hold.
-    pub const CHECK_FAILED: u8 = 3;
-}
 
 /// Captures, understands and drives CAN buses with a cantap analyser.
 #[derive(Parser)]

@@ -1,5 +1,7 @@
 //! What commands that send have in common: what became of each frame, how long to wait, and why frames were not sent.
 
+use std::borrow::Cow;
+use std::collections::BTreeMap;
 use std::io::Write;
 use std::time::Duration;
 
@@ -14,6 +16,7 @@ use cantap::wire::{CHANNELS, Channel};
 
 use crate::interrupt;
 use crate::rescue::Rescue;
+use crate::words::failure_name;
 
 /// How often to check whether to go on.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
@@ -26,6 +29,8 @@ pub struct Sending<'d> {
     quiet: bool,
     sent: u64,
     failed: u64,
+    /// Those that failed, by the reason that the device gave.
+    failures: BTreeMap<Cow<'static, str>, u64>,
     /// Periods that passed before their frame could leave.
     overtaken: u64,
     stands_still: bool,
@@ -43,6 +48,7 @@ impl<'d> Sending<'d> {
             quiet,
             sent: 0,
             failed: 0,
+            failures: BTreeMap::new(),
             overtaken: 0,
             stands_still: false,
             error: None,
@@ -84,7 +90,10 @@ impl<'d> Sending<'d> {
                 }
                 // The frame still waits, and will end once.
                 Err(TransmitFailure::Overtaken { periods }) => self.overtaken += u64::from(periods),
-                Err(_) => self.failed += 1,
+                Err(reason) => {
+                    self.failed += 1;
+                    *self.failures.entry(failure_name(reason)).or_default() += 1;
+                }
             }
         }
         Ok(())
@@ -144,7 +153,13 @@ impl<'d> Sending<'d> {
             (0, _) => Some(Cause::Overtaken),
             _ => Some(self.watch.cause()?),
         };
-        Ok(Outcome { asked, not_sent, overtaken: self.overtaken, is_one_shot: self.failed > 0, cause })
+        let mut left_out = self.failures.clone();
+        let never_left = not_sent.saturating_sub(self.failed);
+        if never_left > 0 {
+            left_out.insert("never left the device".into(), never_left);
+        }
+        let (overtaken, is_one_shot) = (self.overtaken, self.failed > 0);
+        Ok(Outcome { asked, not_sent, left_out, overtaken, is_one_shot, cause })
     }
 
     /// Waits for the rest of a stream, until frames no longer leave or Ctrl-C.
@@ -170,6 +185,8 @@ impl<'d> Sending<'d> {
 pub struct Outcome {
     asked: u64,
     not_sent: u64,
+    /// The same by reason.
+    left_out: BTreeMap<Cow<'static, str>, u64>,
     overtaken: u64,
     /// Some failed for good at the first try.
     is_one_shot: bool,
@@ -178,11 +195,6 @@ pub struct Outcome {
 }
 
 impl Outcome {
-    /// Frames that were asked for and not sent.
-    pub const fn not_sent(&self) -> u64 {
-        self.not_sent
-    }
-
     /// Why, in a sentence with what to do; nothing if all is well.
     pub fn reason(&self) -> Option<String> {
         let Self { asked, not_sent, overtaken, .. } = self;
@@ -231,6 +243,7 @@ impl Outcome {
         serde_json::json!({
             "asked": self.asked,
             "not_sent": self.not_sent,
+            "left_out": self.left_out,
             "overtaken": self.overtaken,
             "reason": self.reason(),
         })

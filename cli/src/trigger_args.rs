@@ -23,9 +23,9 @@ pub struct TriggerArgs {
     /// Also keep what happens in this time after it held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     post: Duration,
-    /// End after the first event.
-    #[arg(long, requires = "trigger")]
-    once: bool,
+    /// End after so many events, and the time after the last one.
+    #[arg(long, value_name = "N", requires = "trigger", value_parser = clap::value_parser!(u64).range(1..))]
+    events: Option<u64>,
     #[command(flatten)]
     databases: DatabaseArgs,
 }
@@ -41,12 +41,12 @@ impl TriggerArgs {
         let condition = Condition::new(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =
-            Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), once: self.once };
+            Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), events: self.events };
         Ok(Some(Trigger::new(condition, window)))
     }
 
     /// Whether nothing more is wanted.
     pub fn is_over(&self, trigger: &Trigger) -> bool {
-        self.once && trigger.counts().events > 0 && !trigger.is_open()
+        self.events.is_some_and(|most| trigger.counts().events >= most) && !trigger.is_open()
     }
 }

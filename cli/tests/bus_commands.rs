@@ -159,7 +159,7 @@ fn status_tells_of_a_bus_that_it_listened_to() {
 #[test]
 fn device_care_is_one_line_each() {
     for (line, out) in [
-        ("identify -d virtual -s 2", "its LEDs blink for 2 s\n"),
+        ("identify -d virtual -t 2", "its LEDs blink for 2 s\n"),
         ("reset -d virtual", "restarting\n"),
         ("defaults save -d virtual -b 250k --mode normal", "saved on the device\n"),
         ("defaults clear -d virtual", "erased from the device\n"),
@@ -209,7 +209,7 @@ fn a_replayed_trace_keeps_its_times_and_order() {
     let (code, out, err) = cantap(&format!("replay -d virtual:load=0 {} --json", path.display()));
     assert_eq!((code, err.as_str()), (Some(0), ""));
     let object: serde_json::Value = serde_json::from_str(&out).unwrap();
-    assert_eq!((&object["frames"], &object["failed"]), (&600.into(), &0.into()));
+    assert_eq!((&object["sent"], &object["not_sent"]), (&600.into(), &0.into()));
     // Both ways a tick's rounding.
     assert!(object["early_us"].as_f64() <= Some(0.2) && object["late_us"].as_f64() <= Some(0.2), "{out}");
     let (code, out, _) = cantap(&format!("replay -d virtual:load=0 {} --speed 4 -v", path.display()));

@@ -361,7 +361,7 @@ fn a_port_in_use_is_refused_and_ctrl_c_ends_a_capture_cleanly() {
 
 #[test]
 fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
-    let (code, out, err) = cantap("demo --seconds 1 --json");
+    let (code, out, err) = cantap("demo --time 1 --json");
     let object = json(&out);
     assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
     assert_eq!(
@@ -390,7 +390,7 @@ fn the_demo_loses_nothing_and_says_so_in_the_promised_object() {
 
 #[test]
 fn a_demo_that_stalls_too_long_counts_every_frame_it_loses() {
-    let (code, out, _) = cantap("demo --seconds 1 --stall 1500ms --frames ext8 --json");
+    let (code, out, _) = cantap("demo --time 1 --stall 1500ms --kind ext8 --json");
     let object = json(&out);
     assert_eq!((code, object["ok"].as_bool()), (Some(0), Some(true)), "{out}");
     for channel in object["channels"].as_array().unwrap() {

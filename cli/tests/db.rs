@@ -46,7 +46,7 @@ fn messages_are_listed_with_cycle_and_comment() {
 
 #[test]
 fn a_message_is_drawn_and_described() {
-    let (code, out, _) = cantap("show", &["car.dbc", "-m", "Eng*"]);
+    let (code, out, _) = cantap("show", &["car.dbc", "--message", "Eng*"]);
     assert_eq!(code, Some(0));
     assert_eq!(
         out,
@@ -70,12 +70,12 @@ fn a_message_is_drawn_and_described() {
          \x20 Temp: bit 0, 12 bits, big-endian, signed, x 0.01 + 250 degK, 229.53 to 270.47\n\
          \x20   of the oil\n"
     );
-    let (_, out, _) = cantap("show", &["car.dbc", "-m", "300"]);
+    let (_, out, _) = cantap("show", &["car.dbc", "--message", "300"]);
     assert!(
         out.contains("  Page is 1:\n") && out.contains("Left: bit 4") && out.contains(", when Page is 2"),
         "{out}"
     );
-    let (code, _, err) = cantap("show", &["car.dbc", "-m", "Engin"]);
+    let (code, _, err) = cantap("show", &["car.dbc", "--message", "Engin"]);
     assert_eq!(
         (code, err.as_str()),
         (Some(1), "cantap: no message of the databases matches \"Engin\"; did you mean Engine?\n")

@@ -92,7 +92,7 @@ fn identify_and_reset_say_what_they_did_and_refuse_nonsense() {
     let (folder, _) = folder("care");
     assert_eq!(cantap(&folder, &["identify", "-d", "virtual"]).1, "its LEDs blink for 5 s\n");
     assert_eq!(cantap(&folder, &["reset", "-d", "virtual"]), (Some(0), "restarting\n".into(), String::new()));
-    for line in [["identify", "-d", "virtual", "-s", "0"], ["identify", "-d", "virtual", "-s", "256"]] {
+    for line in [["identify", "-d", "virtual", "-t", "0"], ["identify", "-d", "virtual", "-t", "256"]] {
         assert_eq!(cantap(&folder, &line).0, Some(2), "{line:?}");
     }
     for command in ["identify", "reset"] {

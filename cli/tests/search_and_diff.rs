@@ -55,7 +55,9 @@ fn frames_are_found_by_identifier_data_and_condition() {
         (&["--id", "123", "byte[1] > 0x30"], &[8]),
     ] {
         let (code, out, err) = cantap("search", &[&["search", "a.log", "--json"], arguments].concat());
-        let found: Vec<_> = out
+        let (lines, summary) = out.trim_end().rsplit_once('\n').unwrap();
+        assert!(summary.starts_with(&format!("{{\"summary\":{{\"found\":{}", expected.len())), "{summary}");
+        let found: Vec<_> = lines
             .lines()
             .map(|line| {
                 serde_json::from_str::<serde_json::Value>(line).unwrap()["time_s"].as_f64().unwrap() as usize
@@ -137,11 +139,11 @@ fn differences_are_listed() {
     assert_eq!(code, Some(0));
     assert_eq!(
         out,
-        "can0 123: only in a.log (3 frames)\n\
-         can0 124: only in b.log (1 frames)\n\
-         can0 001: period 2250.000 ms -> 2000.000 ms\n\
-         can0 001: byte 0 0x1x000x -> 0x10000x\n\
-         can0 002: period 3000.000 ms -> 2000.000 ms\n\
+        "channel 1, 123: only in a.log (3 frames)\n\
+         channel 1, 124: only in b.log (1 frames)\n\
+         channel 1, 001: period 2250.000 ms -> 2000.000 ms\n\
+         channel 1, 001: byte 0 0x1x000x -> 0x10000x\n\
+         channel 1, 002: period 3000.000 ms -> 2000.000 ms\n\
          1 only in the first, 1 only in the second, 2 changed, 0 the same\n"
     );
     let (code, out, _) =

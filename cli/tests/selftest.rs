@@ -22,7 +22,7 @@ fn outcomes(object: &Value) -> Vec<(&str, &str)> {
 fn a_good_device_passes_alone_and_the_report_has_lines_and_object() {
     let folder = tempfile::tempdir().unwrap();
     let file = folder.path().join("board.txt");
-    let line = format!("selftest -d virtual:load=0 --seconds 300ms --report {}", file.display());
+    let line = format!("selftest -d virtual:load=0 --load-time 300ms --report {}", file.display());
     let (code, out, err) = cantap(&line);
     assert_eq!((code, err.as_str()), (Some(0), ""), "{out}");
     assert!(
@@ -49,7 +49,7 @@ fn a_good_device_passes_alone_and_the_report_has_lines_and_object() {
 #[test]
 fn two_channels_on_one_wire_pass_the_loop() {
     let (code, out, _) =
-        cantap("selftest -d virtual:load=0,wire=joined,ack=no --loop --seconds 300ms --json");
+        cantap("selftest -d virtual:load=0,wire=joined,ack=no --loop --load-time 300ms --json");
     let object: Value = serde_json::from_str(&out).unwrap();
     assert_eq!(code, Some(0), "{:#}", object["steps"]);
     let outcomes = outcomes(&object);
@@ -67,7 +67,7 @@ fn two_channels_on_one_wire_pass_the_loop() {
 
 #[test]
 fn a_loop_that_is_not_there_fails_and_says_what_to_look_at() {
-    let (code, out, _) = cantap("selftest -d virtual:load=0,ack=no --loop --seconds 300ms");
+    let (code, out, _) = cantap("selftest -d virtual:load=0,ack=no --loop --load-time 300ms");
     assert_eq!(code, Some(3), "{out}");
     let line =
         out.lines().find(|line| line.starts_with("FAIL  channel 1 to channel 2 and back, 500000")).unwrap();
@@ -80,8 +80,10 @@ fn a_loop_that_is_not_there_fails_and_says_what_to_look_at() {
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_emulated_board_passes() {
     let elf = firmware::elf();
-    let line =
-        format!("selftest -d emu:{},load=0,wire=joined,ack=no --loop --seconds 500ms --json", elf.display());
+    let line = format!(
+        "selftest -d emu:{},load=0,wire=joined,ack=no --loop --load-time 500ms --json",
+        elf.display()
+    );
     let (code, out, err) = cantap(&line);
     let object: Value = serde_json::from_str(&out).unwrap_or_else(|_| panic!("{err}"));
     assert_eq!(code, Some(0), "{:#}", object["steps"]);

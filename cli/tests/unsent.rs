@@ -100,13 +100,16 @@ fn totals_name_every_frame_that_was_asked_for() {
             "{line}: {err}"
         );
         let object: serde_json::Value = serde_json::from_str(&lines.concat()).unwrap();
-        assert_eq!((&object["frames"], &object["failed"]), (&0.into(), &count.into()), "{line}");
+        assert_eq!((&object["sent"], &object["not_sent"]), (&0.into(), &count.into()), "{line}");
         let reason = object["reason"].as_str().unwrap();
         assert_eq!(err, format!("cantap: {reason}\n"));
     }
     let (code, lines, _) = cantap(&format!("replay -d virtual:load=0 -b 500k {} --json", many.display()));
     let object: serde_json::Value = serde_json::from_str(&lines.concat()).unwrap();
-    assert_eq!((code, &object["failed"], &object["reason"]), (Some(0), &0.into(), &serde_json::Value::Null));
+    assert_eq!(
+        (code, &object["not_sent"], &object["reason"]),
+        (Some(0), &0.into(), &serde_json::Value::Null)
+    );
 }
 
 #[test]

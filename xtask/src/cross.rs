@@ -33,6 +33,8 @@ pub const WASM: &[Check] = &[Check {
         "cantap-signals",
         "-p",
         "cantap-analysis",
+        "-p",
+        "cantap-protocols",
         "--no-default-features",
         "--features",
         "cantap-analysis/plot",

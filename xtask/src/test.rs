@@ -121,7 +121,7 @@ impl Step {
             Step::Reproducible => reproducible::check(shell, toolchain)?,
             Step::Tests => tests::run(shell, peers)?,
             Step::Kernel => return kernel::run(shell),
-            Step::Demo => cmd!(shell, "cargo demo --seconds 3").run()?,
+            Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,
         }
         Ok(Outcome::Passed)

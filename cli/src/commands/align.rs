@@ -5,15 +5,17 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
-use cantap_formats::{Format, LeftOut, ReadOptions, TraceWriter, create_writer, open_reader};
+use cantap_formats::{Format, LeftOut, ReadOptions, open_reader};
 use cantap_trace::TraceRecord;
 use cantap_trace::align::{Agreement, AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
 use serde_json::{Value, json};
 
-use super::convert::{WriteArgs, refuse_same_file, report};
+use super::convert::{WriteArgs, refuse_same_file};
 use crate::args::duration;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
+use crate::missing::Missing;
+use crate::trace_output::TraceOutput;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -30,7 +32,7 @@ pub struct Args {
     #[arg(value_name = "TRACE", required = true, num_args = 2..)]
     traces: Vec<PathBuf>,
     /// The trace to write, with all channels.
-    #[arg(short, long, value_name = "OUT")]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// The format of the traces, where neither their names nor their beginnings tell.
     #[arg(long, value_name = "FORMAT")]
@@ -74,16 +76,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let (alignments, offsets) = find(args)?;
     let mut merged = Merged::open(args, alignments, &offsets)?;
-    let mut writer = match &args.output {
-        Some(path) => Some(Output::create(path, args)?),
+    let mut output = match &args.output {
+        Some(path) => Some(TraceOutput::create(path, &args.write.options(None)?, false)?),
         None => None,
     };
     while let Some(record) = merged.next()? {
-        if let Some(writer) = &mut writer {
-            writer.write(&record)?;
+        if let Some(output) = &mut output {
+            output.write(&record)?;
         }
     }
-    let left_out = writer.map(Output::finish).transpose()?;
+    let not_carried = output.map(TraceOutput::finish).transpose()?.unwrap_or_default();
+    let missing: Vec<Missing> = merged.sources.iter().map(Records::missing).collect();
     let found: Vec<Found> = merged
         .others
         .into_iter()
@@ -95,7 +98,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         })
         .collect();
     if args.json {
-        println!("{}", to_json(args, &found, left_out.as_ref()));
+        println!("{}", to_json(args, &found, &missing, &not_carried));
     } else {
         for (path, found) in args.traces[1..].iter().zip(&found) {
             print(&args.traces[0], path, found);
@@ -215,34 +218,6 @@ impl<'a> Merged<'a> {
     }
 }
 
-/// The trace being written.
-struct Output<'a> {
-    path: &'a Path,
-    writer: Box<dyn TraceWriter>,
-}
-
-impl<'a> Output<'a> {
-    fn create(path: &'a Path, args: &Args) -> anyhow::Result<Self> {
-        let options = args.write.options(None)?;
-        let writer = create_writer(path, &options).with_context(|| failed(path))?;
-        Ok(Self { path, writer })
-    }
-
-    fn write(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
-        self.writer.write(record).with_context(|| failed(self.path))
-    }
-
-    fn finish(self) -> anyhow::Result<LeftOut> {
-        let left_out = self.writer.finish().with_context(|| failed(self.path))?;
-        report(&left_out, self.path);
-        Ok(left_out)
-    }
-}
-
-fn failed(path: &Path) -> String {
-    format!("cannot write {}", path.display())
-}
-
 fn print(first: &Path, path: &Path, found: &Found) {
     let (first, path) = (first.display(), path.display());
     let Found { alignment, agreement, channel_offset } = found;
@@ -277,7 +252,7 @@ fn us(ns: u64) -> f64 {
     ns as f64 / 1e3
 }
 
-fn to_json(args: &Args, found: &[Found], left_out: Option<&LeftOut>) -> Value {
+fn to_json(args: &Args, found: &[Found], missing: &[Missing], not_carried: &LeftOut) -> Value {
     let traces = args.traces[1..].iter().zip(found).map(|(path, found)| {
         let Found { alignment, agreement, channel_offset } = found;
         json!({
@@ -299,10 +274,14 @@ fn to_json(args: &Args, found: &[Found], left_out: Option<&LeftOut>) -> Value {
             },
         })
     });
-    let left_out: serde_json::Map<_, _> = left_out
-        .into_iter()
-        .flat_map(LeftOut::iter)
-        .map(|(what, count)| (what.to_owned(), count.into()))
-        .collect();
-    json!({ "first": args.traces[0].display().to_string(), "traces": traces.collect::<Vec<_>>(), "left_out": left_out })
+    let mut object =
+        json!({ "first": args.traces[0].display().to_string(), "traces": traces.collect::<Vec<_>>() });
+    let mut all = Missing::default();
+    for missing in missing {
+        all.merge(missing);
+    }
+    all.left_out.merge(not_carried);
+    all.put_into(&mut object);
+    object["missing_pct"] = missing.iter().map(Missing::share_pct).collect();
+    object
 }

@@ -24,8 +24,8 @@ pub struct Args {
     #[arg(short, long, default_value = "1", value_parser = args::channel)]
     channel: Channel,
     /// Give up after this time without any sign of traffic, but not before each common rate was tried once.
-    #[arg(short, long, default_value = "10s", value_name = "TIME", value_parser = args::duration)]
-    timeout: Duration,
+    #[arg(short, long, alias = "timeout", default_value = "10s", value_name = "TIME", value_parser = args::positive_duration)]
+    time: Duration,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -43,7 +43,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         !interrupt::requested()
     };
-    let limits = Limits { silence: args.timeout, ..Limits::default() };
+    let limits = Limits { silence: args.time, ..Limits::default() };
     let outcome = autobaud::search(&device, args.channel, &limits, &mut progress)?;
     if shown {
         eprint!("\r\x1b[K");

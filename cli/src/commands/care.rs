@@ -3,6 +3,7 @@
 use std::io::Write;
 use std::process::ExitCode;
 
+use crate::args;
 use crate::boards::OneBoard;
 
 /// The command line of `cantap identify`.
@@ -10,9 +11,15 @@ use crate::boards::OneBoard;
 pub struct Identify {
     #[command(flatten)]
     device: OneBoard,
-    /// How long to show the pattern, in seconds.
-    #[arg(short, long, default_value_t = 5, value_parser = clap::value_parser!(u8).range(1..))]
-    seconds: u8,
+    /// How long to show the pattern: whole seconds, up to 255.
+    #[arg(short, long, alias = "seconds", value_name = "TIME", default_value = "5s", value_parser = whole_seconds)]
+    time: u8,
+}
+
+fn whole_seconds(text: &str) -> Result<u8, String> {
+    let time = args::positive_duration(text)?;
+    let seconds = u8::try_from(time.as_secs()).ok().filter(|_| time.subsec_nanos() == 0);
+    seconds.ok_or_else(|| "give whole seconds, up to 255s".to_owned())
 }
 
 /// The command line of `cantap reset`.
@@ -24,8 +31,8 @@ pub struct Reset {
 
 /// Runs `cantap identify`.
 pub fn identify(args: &Identify) -> anyhow::Result<ExitCode> {
-    args.device.open()?.identify(args.seconds)?;
-    writeln!(std::io::stdout(), "its LEDs blink for {} s", args.seconds)?;
+    args.device.open()?.identify(args.time)?;
+    writeln!(std::io::stdout(), "its LEDs blink for {} s", args.time)?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -5,15 +5,14 @@ use std::process::ExitCode;
 
 use anyhow::{Context, bail};
 use cantap_formats::time_range::{TimePoint, TimeRange};
-use cantap_formats::{
-    DifConvention, Format, LeftOut, LineEnd, RotateAt, Rotation, TableStyle, TraceWriter, WriteOptions, Zone,
-    create_writer,
-};
+use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone};
 use cantap_trace::filter::Filter;
 
-use crate::beside::Beside;
+use crate::args;
 use crate::input::ReadArgs;
 use crate::interrupt;
+use crate::missing::by_kind;
+use crate::trace_output::{TraceOutput, failed};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -53,8 +52,8 @@ pub struct Args {
     /// Only these frames, as FILTER.
     #[arg(short, long = "filter", value_name = "FILTER")]
     filter_options: Vec<Filter>,
-    /// Only this channel, from 1. Repeat for any of several.
-    #[arg(short, long, value_name = "N")]
+    /// Only these channels: 1, 2, several as 1,3. Can be repeated. All without it.
+    #[arg(short, long, value_delimiter = ',', value_parser = args::channel_of_trace)]
     channel: Vec<u8>,
     /// From here on: seconds from the first record (also 90s, 10m, 2h), seconds since 1970, or a date in UTC.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
@@ -123,27 +122,14 @@ impl WriteArgs {
     }
 }
 
-/// How a file is called in messages.
-pub fn shown(path: &Path) -> String {
-    if path.as_os_str() == "-" { "standard output".to_owned() } else { path.display().to_string() }
-}
-
-/// Says what a finished file could not carry.
-pub fn report(left_out: &LeftOut, path: &Path) {
-    for (what, count) in left_out.iter() {
-        eprintln!("cantap: {} does not carry {what} ({count})", shown(path));
-    }
-}
-
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
     let mut options = args.write.options(None)?;
-    let failed = || format!("cannot write {}", shown(&args.output));
     if options.format.is_none() && args.output.as_os_str() != "-" {
         let format = Format::of_path(&args.output);
         let format = format.map_err(|error| std::io::Error::new(std::io::ErrorKind::InvalidInput, error));
-        options.format = Some(format.with_context(failed)?);
+        options.format = Some(format.with_context(|| failed(&args.output))?);
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
@@ -153,14 +139,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if grows {
         interrupt::watch()?;
     }
-    let mut writer: Option<Box<dyn TraceWriter>> = None;
-    let mut beside = None;
+    let mut output: Option<TraceOutput> = None;
     // Not before there is something to write: where nothing can be read, an older OUT stays as it is.
-    let mut create = || -> anyhow::Result<_> {
-        beside = if args.write.rotate.is_empty() && !grows { Beside::of(&args.output) } else { None };
-        let path = beside.as_ref().map_or(&args.output, |beside: &Beside| &beside.temporary);
-        create_writer(path, &options).with_context(failed)
-    };
+    let create = || TraceOutput::create(&args.output, &options, grows);
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
@@ -171,45 +152,38 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             Ok(false) => break Ok(()),
             Err(error) => break Err(error),
         }
-        let writer = match &mut writer {
-            Some(writer) => writer,
+        let output = match &mut output {
+            Some(output) => output,
             none => none.insert(create()?),
         };
         for record in &batch {
             // The window's first record is the trace's, whatever the channel.
             let inside = window.contains(record);
             if inside && (args.channel.is_empty() || args.channel.contains(&record.channel)) {
-                writer.write(record).with_context(failed)?;
+                output.write(record)?;
                 written += 1;
             }
         }
         if records.may_wait() {
-            writer.flush().with_context(failed)?;
+            output.flush()?;
         }
     };
-    let writer = match (writer, &read) {
-        (Some(writer), _) => writer,
+    let output = match (output, &read) {
+        (Some(output), _) => output,
         // An empty trace is one all the same.
         (None, Ok(())) => create()?,
         (None, Err(_)) => return read.map(|()| ExitCode::SUCCESS),
     };
-    let mut left_out = writer.finish().with_context(failed)?;
-    if let Some(beside) = beside {
-        beside.put_in_place().with_context(failed)?;
-    }
-    report(&left_out, &args.output);
+    let mut left_out = output.finish()?;
     read?;
     if args.json {
-        let object = |counts: &LeftOut| -> serde_json::Map<_, _> {
-            counts.iter().map(|(what, count)| (what.to_owned(), count.into())).collect()
-        };
         let missing = records.missing();
         left_out.merge(&missing.left_out);
         let summary = serde_json::json!({
             "records": written,
             "issues": missing.issues,
-            "notes": object(&records.notes()),
-            "left_out": object(&left_out),
+            "notes": by_kind(&records.notes()),
+            "left_out": by_kind(&left_out),
             "missing_pct": missing.share_pct(),
         });
         if args.output.as_os_str() == "-" { eprintln!("{summary}") } else { println!("{summary}") }

@@ -17,7 +17,7 @@ use crate::words::counted;
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
     cantap db car.dbc\n  \
-    cantap db car.dbc -m EngineData -m 'Body*'\n  \
+    cantap db car.dbc --message EngineData --message 'Body*'\n  \
     cantap db car.dbc --coverage trace.log\n\n\
 In a layout the highest bit is on the left; < is a signal's most significant bit, x its least significant one,\n\
 X a bit that several signals have.")]
@@ -27,7 +27,7 @@ pub struct Args {
     files: Vec<PathBuf>,
     /// Show these messages in full: layout, signals, texts, comments. A name with *, ? and [a-z], or an identifier in hexadecimal
     /// (3 or 8 digits). Can be repeated.
-    #[arg(short, long = "message", value_name = "PATTERN")]
+    #[arg(long = "message", value_name = "PATTERN")]
     messages: Vec<String>,
     /// Compare with this trace: which identifiers the databases lack, which messages never came, actual against nominal cycles.
     #[arg(long, value_name = "TRACE", conflicts_with = "messages")]
@@ -51,13 +51,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         args.files.iter().map(|path| cantap_signals::load(path)).collect::<Result<_, _>>()?;
     let mut out = BufWriter::new(std::io::stdout().lock());
     if let Some(trace) = &args.coverage {
-        coverage::run(args, databases, trace, &mut out)?;
+        coverage::run(databases, args.j1939, args.read.open(trace)?, args.json, &mut out)?;
     } else if args.warnings {
         warnings(args, &databases, &mut out)?;
     } else if args.messages.is_empty() {
         list(args, &databases, &mut out)?;
     } else {
-        describe::run(args, &databases, &mut out)?;
+        describe::run(&args.messages, args.json, &databases, &mut out)?;
     }
     out.flush()?;
     Ok(ExitCode::SUCCESS)

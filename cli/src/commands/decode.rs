@@ -23,6 +23,7 @@ use crate::args;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
+use crate::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -34,7 +35,8 @@ use crate::live::LiveArgs;
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
     identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
-With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.")]
+With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
+The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]
 pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
@@ -57,7 +59,7 @@ pub struct Args {
     /// frames were lost. Written at the end of the trace.
     #[arg(long, value_name = "TIME", requires = "csv", value_parser = args::positive_duration)]
     resample: Option<Duration>,
-    /// One JSON object per message.
+    /// Print one JSON object per message, and behind them one with the summary.
     #[arg(long)]
     json: bool,
     /// Unit, text and raw value of each signal too.
@@ -71,11 +73,11 @@ pub struct Args {
 }
 
 /// What the summary says.
-#[derive(Default)]
+#[derive(Default, serde::Serialize)]
 struct Count {
     frames: u64,
     decoded: u64,
-    signals: u64,
+    values: u64,
     lost: u64,
 }
 
@@ -87,17 +89,22 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    let count = decode(args, &decoder, &mut out)?;
+    let (count, missing) = decode(args, &decoder, &mut out)?;
+    if args.json {
+        let mut summary = serde_json::to_value(&count)?;
+        missing.put_into(&mut summary);
+        writeln!(out, "{}", serde_json::json!({ "summary": summary }))?;
+    }
     out.flush()?;
-    let Count { frames, decoded, signals, lost } = count;
-    eprintln!("cantap: decoded {decoded} of {frames} frames, {signals} values");
+    let Count { frames, decoded, values, lost } = count;
+    eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values");
     if lost > 0 {
         eprintln!("cantap: {lost} frames or more are missing in the trace");
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<Count> {
+fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<(Count, Missing)> {
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut count = Count::default();
     let mut values = Vec::new();
@@ -123,7 +130,7 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
                 continue;
             }
             count.decoded += 1;
-            count.signals += values.len() as u64;
+            count.values += values.len() as u64;
             let message = decoder.message(reference);
             let decoded = Decoded { record, frame, reference, message, values: &values };
             match (&mut wide, args.json, args.csv) {
@@ -140,5 +147,5 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
     if let Some(wide) = wide {
         wide.finish(out)?;
     }
-    Ok(count)
+    Ok((count, records.missing()))
 }

@@ -10,7 +10,7 @@ use anyhow::Context;
 use cantap::device::{Link, Records};
 use cantap::wire::CHANNELS;
 use cantap::{Channel, Device, TraceRecord};
-use cantap_formats::{Format, ReadOptions, TraceWriter, WriteOptions, create_writer, open_reader};
+use cantap_formats::{Format, ReadOptions, WriteOptions, open_reader};
 use cantap_virtual::simbus::Frames;
 use cantap_virtual::{Options, SequenceCheck, start};
 use indicatif::{ProgressBar, ProgressStyle};
@@ -20,6 +20,7 @@ use crate::exit;
 use crate::interrupt;
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
+use crate::trace_output::TraceOutput;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -29,23 +30,23 @@ use crate::meter::{Meter, rounded};
                         Exit code 0 means that every frame sent was received in order or counted lost.\n\n\
                         Examples:\n  cantap demo\n  cantap demo --stall 400ms     the device's queue bridges it\n  \
                         cantap demo --stall 3s        frames are lost, and every one is counted\n  \
-                        cantap demo --frames ext8 --load 80 --seconds 20 --json"
+                        cantap demo --kind ext8 --load 80 --time 20s --json"
 )]
 pub struct Args {
-    /// How long to capture, in seconds or as 500ms, 2m.
-    #[arg(long, default_value = "5", value_parser = args::duration)]
-    seconds: Duration,
+    /// How long to capture, as 10, 500ms or 2m.
+    #[arg(short, long, alias = "seconds", value_name = "TIME", default_value = "5s", value_parser = args::positive_duration)]
+    time: Duration,
     /// Bus load in per cent.
     #[arg(long, default_value = "100", value_name = "PCT", value_parser = args::percent)]
     load: f64,
     /// Which frames: std0, std8, ext0, ext8, rtr or mix.
-    #[arg(long, default_value = "std0")]
-    frames: Frames,
+    #[arg(long, alias = "frames", default_value = "std0")]
+    kind: Frames,
     /// The host stops reading for this time in mid-run.
     #[arg(long, value_name = "TIME", value_parser = args::duration)]
     stall: Option<Duration>,
     /// Keep the captured trace in this file.
-    #[arg(short, long)]
+    #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
@@ -82,8 +83,8 @@ struct Summary {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     interrupt::watch()?;
-    let length = args.stall.map_or(args.seconds, |stall| args.seconds.max(stall + 2 * AROUND_STALL));
-    let options = Options { load_percent: args.load, frames: args.frames, ..Options::default() };
+    let length = args.stall.map_or(args.time, |stall| args.time.max(stall + 2 * AROUND_STALL));
+    let options = Options { load_percent: args.load, frames: args.kind, ..Options::default() };
     let connection = start(options.clone())?;
     let witness = Arc::clone(&connection.witness);
     let stall = Stall::default();
@@ -207,7 +208,7 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
     writeln!(
         out,
         "two channels at 1 Mbit/s, {} % load of {} frames, {} s",
-        args.load, args.frames, summary.seconds
+        args.load, args.kind, summary.seconds
     )?;
     for channel in &summary.channels {
         let ChannelSummary { channel, sent, delivered, lost, frames_per_s, bus_load_pct } = channel;
@@ -238,7 +239,7 @@ fn report(args: &Args, summary: &Summary) -> anyhow::Result<()> {
 
 /// The captured trace: where the user wants it, or in a temporary file that is read back and removed.
 struct TraceFile {
-    writer: Box<dyn TraceWriter>,
+    writer: TraceOutput,
     temporary: Option<tempfile::TempPath>,
 }
 
@@ -251,7 +252,8 @@ impl TraceFile {
         }
         let path = output.or(temporary.as_deref()).unwrap_or(Path::new("-"));
         let format = path.extension().is_none().then_some(Format::Candump);
-        let writer = create_writer(path, &WriteOptions { format, ..WriteOptions::default() })
+        let options = WriteOptions { format, ..WriteOptions::default() };
+        let writer = TraceOutput::create(path, &options, temporary.is_some())
             .with_context(|| format!("cannot write to '{}'; choose another place with -o", path.display()))?;
         Ok(Self { writer, temporary })
     }

@@ -4,12 +4,12 @@ use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use cantap_trace::Interface;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
 use crate::exit;
-use crate::input::{Missing, ReadArgs};
+use crate::input::ReadArgs;
+use crate::missing::Missing;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -48,16 +48,15 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let ((a, missing_a), (b, missing_b)) = (profile(args, &args.a)?, profile(args, &args.b)?);
+    let ((a, mut missing_a), (b, missing_b)) = (profile(args, &args.a)?, profile(args, &args.b)?);
     let difference = compare(&a, &b, args.tolerance / 100.0);
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
         let mut object = to_json(&difference);
-        let mut left_out = missing_a.left_out.clone();
-        left_out.merge(&missing_b.left_out);
-        object["issues"] = (missing_a.issues + missing_b.issues).into();
-        object["left_out"] = Missing { left_out, ..Missing::default() }.by_kind().into();
-        object["missing_pct"] = json!([missing_a.share_pct(), missing_b.share_pct()]);
+        let shares = json!([missing_a.share_pct(), missing_b.share_pct()]);
+        missing_a.merge(&missing_b);
+        missing_a.put_into(&mut object);
+        object["missing_pct"] = shares;
         writeln!(out, "{object}")?;
     } else {
         print(args, &difference, &mut out)?;
@@ -80,7 +79,7 @@ fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing)> {
 }
 
 fn name(args: &Args, key: Key) -> String {
-    let channel = if args.ignore_channels { String::new() } else { format!("{} ", Interface(key.channel)) };
+    let channel = if args.ignore_channels { String::new() } else { format!("channel {}, ", key.channel) };
     format!(
         "{channel}{}{}",
         key.id,

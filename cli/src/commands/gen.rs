@@ -1,7 +1,8 @@
 //! `cantap gen`: made-up frames, with cangen's options.
 
+use std::io::Write;
 use std::process::ExitCode;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use cantap::device::Transmission;
@@ -9,11 +10,13 @@ use cantap::replay::{Pace, Replay};
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
 use cantap::{Channel, Frame, Id, bits_on_bus};
+use serde_json::{Value, json};
 
 use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::interrupt;
+use crate::meter::rounded;
 use crate::sending::Sending;
 use crate::wrong::wrong;
 
@@ -60,7 +63,7 @@ pub struct Args {
     #[arg(short = 'D', long, value_name = "MODE|HEX", default_value = "r", value_parser = data)]
     data: Data,
     /// End after this many frames.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Frames of a burst: they follow one another at once, and the gap is from burst to burst.
     #[arg(short = 'c', long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
@@ -89,6 +92,9 @@ pub struct Args {
     /// Print each frame that was sent.
     #[arg(short, long)]
     verbose: bool,
+    /// Print one JSON object with the summary.
+    #[arg(long, conflicts_with = "verbose")]
+    json: bool,
 }
 
 /// One channel, or both in turns.
@@ -244,20 +250,36 @@ impl Filled {
         }
     }
 
-    fn tell(&self, tick_hz: u32) {
-        for channel in Channel::ALL {
+    /// Each channel's frames in a second, and its load in per cent, from what was sent here alone.
+    fn rates(&self, tick_hz: u32) -> impl Iterator<Item = (Channel, f64, f64)> + use<'_> {
+        Channel::ALL.into_iter().filter_map(move |channel| {
             let index = channel.index();
-            let Some((first, last)) = self.span_ticks[index].filter(|(first, last)| first < last) else {
-                continue;
-            };
+            let (first, last) = self.span_ticks[index].filter(|(first, last)| first < last)?;
             let seconds = (last - first) as f64 / f64::from(tick_hz);
             let load_pct = self.bits[index] as f64 * 100.0 / (f64::from(self.bitrates_bps[index]) * seconds);
-            let frames_per_s = self.frames[index] as f64 / seconds;
+            Some((channel, self.frames[index] as f64 / seconds, load_pct))
+        })
+    }
+
+    fn tell(&self, tick_hz: u32) {
+        for (channel, frames_per_s, load_pct) in self.rates(tick_hz) {
             eprintln!(
                 "cantap: channel {}: {frames_per_s:.0} frames/s, bus load {load_pct:.1} %",
                 channel.number()
             );
         }
+    }
+
+    fn object(&self, tick_hz: u32) -> Value {
+        self.rates(tick_hz)
+            .map(|(channel, frames_per_s, load_pct)| {
+                json!({
+                    "channel": channel.number(),
+                    "frames_per_s": rounded(frames_per_s, 1),
+                    "bus_load_pct": rounded(load_pct, 2),
+                })
+            })
+            .collect()
     }
 }
 
@@ -283,6 +305,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
     let mut generator = Generator { args, random: fastrand::Rng::with_seed(args.seed), count: 0 };
     let mut filled = Filled::new(bitrates_bps);
+    let started = Instant::now();
     let mut turns = args.channel.iter().cycle();
     while args.frames.is_none_or(|frames| generator.count < frames)
         && let Some(channel) = turns.next()
@@ -303,9 +326,17 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let asked = if sending.stands_still() { args.frames.unwrap_or(generator.count) } else { sending.ended() };
     let outcome = sending.outcome(asked)?;
     device.stop()?;
-    eprintln!("cantap: {} frames sent", sending.sent());
-    if args.saturate {
-        filled.tell(device.hello().tick_hz);
+    if args.json {
+        let mut object = outcome.object();
+        object["sent"] = sending.sent().into();
+        object["seconds"] = rounded(started.elapsed().as_secs_f64(), 3).into();
+        object["channels"] = filled.object(device.hello().tick_hz);
+        writeln!(std::io::stdout(), "{object}")?;
+    } else {
+        eprintln!("cantap: {} frames sent", sending.sent());
+        if args.saturate {
+            filled.tell(device.hello().tick_hz);
+        }
     }
     outcome.verdict()?;
     Ok(ExitCode::SUCCESS)

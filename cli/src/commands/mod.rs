@@ -6,6 +6,7 @@ pub mod bits;
 pub mod capture;
 pub mod care;
 pub mod completions;
+pub mod conversations;
 pub mod convert;
 pub mod db;
 pub mod decode;
@@ -54,6 +55,8 @@ pub enum Command {
     Timing(timing::Args),
     /// Capture what a device hears into a file.
     Capture(capture::Args),
+    /// Show what the frames mean: requests and responses, transfers, by protocol.
+    Conversations(conversations::Args),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -108,6 +111,7 @@ impl Command {
             Self::Search(args) => search::run(&args),
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
+            Self::Conversations(args) => conversations::run(&args),
             Self::Completions(args) => completions::run(&args, line),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

@@ -11,7 +11,6 @@ use cantap::wire::message::Mode;
 use cantap_trace::filter::Filter;
 
 use crate::address::{Address, AddressError};
-use crate::args;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -25,6 +24,7 @@ use crate::monitor::source::Origin;
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
 use crate::wrong::wrong;
+use crate::{args, beside};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -77,7 +77,7 @@ pub struct Args {
     #[arg(long, value_name = "FILE", requires = "once")]
     svg: Option<PathBuf>,
     /// With --once: how long to watch a device.
-    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short = 't', long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     time: Duration,
     /// With --once: the screen's size.
     #[arg(long, value_name = "COLUMNSxROWS", default_value = "80x24", value_parser = size)]
@@ -144,7 +144,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         let screen = once(origin, app, model, receiver, args.size, args.time)?;
         match &args.svg {
             None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
-            Some(path) => std::fs::write(path, picture::svg(&screen))
+            Some(path) => beside::write(path, picture::svg(&screen).as_bytes())
                 .with_context(|| format!("cannot write {}", path.display()))?,
         }
     } else {

@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use anyhow::bail;
+use anyhow::{Context, bail};
 use cantap::Id;
 use cantap_analysis::plot::{
     Axis, Content, DEFAULT_WIDTH, LoadCollector, MOST_CURVES, PictureFormat, Plot, SignalCollector,
@@ -14,10 +14,13 @@ use cantap_analysis::plot::{
 use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
 
-use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
+use crate::missing::Missing;
+use crate::trace_output::failed;
+use crate::{args, beside};
+use serde_json::json;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -43,10 +46,10 @@ pub struct Args {
     #[arg(long, value_name = "ID", conflicts_with = "signals")]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]BITRATE", requires = "bus_load")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load")]
     bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
-    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
     /// The file to write: .svg, .png or .html.
     #[arg(short, long, value_name = "FILE")]
@@ -72,6 +75,9 @@ pub struct Args {
     /// Leave out what is wrong with databases that can be used, and which of them replaces another.
     #[arg(short, long)]
     quiet: bool,
+    /// Print one JSON object about the picture.
+    #[arg(long, requires = "output")]
+    json: bool,
     #[command(flatten)]
     read: ReadArgs,
 }
@@ -82,36 +88,59 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(path) = &args.output {
         PictureFormat::of_path(path)?;
     }
-    let mut plot = collect(args)?;
+    let (mut plot, read) = collect(args)?;
     for pane in &mut plot.panes {
         if matches!(pane.content, Content::Analogue(_)) {
             pane.range = args.vertical.or(pane.range);
         }
     }
     match &args.output {
-        Some(path) => plot.save(path, args.width.unwrap_or(DEFAULT_WIDTH))?,
+        Some(path) => {
+            let picture = plot.render(PictureFormat::of_path(path)?, args.width.unwrap_or(DEFAULT_WIDTH))?;
+            beside::write(path, &picture).with_context(|| failed(path))?;
+        }
         None => std::io::stdout().lock().write_all(plot.to_text(&terminal_style(args)).as_bytes())?,
+    }
+    if let (Some(path), true) = (&args.output, args.json) {
+        let curves = plot.panes.iter().flat_map(|pane| pane.content.curves());
+        let mut object = json!({
+            "output": path.display().to_string(),
+            "curves": curves.map(|curve| curve.name.as_str()).collect::<Vec<_>>(),
+            "not_drawn": read.not_drawn,
+        });
+        read.missing.put_into(&mut object);
+        writeln!(std::io::stdout(), "{object}")?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn collect(args: &Args) -> anyhow::Result<Plot> {
+/// What there is to know of the trace besides its picture.
+#[derive(Default)]
+struct Read {
+    /// When the part that is drawn begins.
+    first_ns: Option<i64>,
+    missing: Missing,
+    /// Signals that were too many.
+    not_drawn: u64,
+}
+
+fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
     let name = args.input.file_name().map_or("-".into(), |name| name.to_string_lossy());
     let title = |what: &str| args.title.clone().unwrap_or_else(|| format!("{name}: {what}"));
     if args.bus_load {
         let options = Options { window: args.window, ..ChannelBitrate::options(&args.bitrates) };
         let mut collector = LoadCollector::new(options)?;
-        let first_ns = for_each(args, |record| collector.push(record))?;
-        return Ok(dated(collector.finish(title("bus load")), first_ns));
+        let read = for_each(args, |record| collector.push(record))?;
+        return Ok((dated(collector.finish(title("bus load")), read.first_ns), read));
     }
     if let Some(id) = args.timing {
         let mut collector = TimingCollector::new(id);
-        for_each(args, |record| collector.push(record))?;
+        let read = for_each(args, |record| collector.push(record))?;
         let plot = collector.finish(title(&format!("periods of {id}")));
         if plot.panes.is_empty() {
             bail!("there are no two frames of {id} without a loss between them in {name}");
         }
-        return Ok(plot);
+        return Ok((plot, read));
     }
     if args.databases.is_empty() {
         bail!(
@@ -120,21 +149,22 @@ fn collect(args: &Args) -> anyhow::Result<Plot> {
     }
     let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);
-    let first_ns = for_each(args, |record| collector.push(record))?;
+    let mut read = for_each(args, |record| collector.push(record))?;
     if collector.is_empty() {
         bail!("none of the signals is in {name}; `cantap decode` shows what is");
     }
-    if collector.left_out() > 0 {
+    read.not_drawn = collector.left_out();
+    if read.not_drawn > 0 {
         let curves = args.curves;
         eprintln!(
             "cantap: only the first {curves} signals are drawn; choose with --signal PATTERN, or draw more with --curves"
         );
     }
-    Ok(dated(collector.finish(title("signals")), first_ns))
+    Ok((dated(collector.finish(title("signals")), read.first_ns), read))
 }
 
-/// Reads the part of the trace that is to be drawn; returns when it begins.
-fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<Option<i64>> {
+/// Reads the part of the trace that is to be drawn.
+fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::Result<Read> {
     let mut records = args.read.open(&args.input)?;
     let mut window = TimeRange::new(args.start, args.end);
     let mut batch = Vec::new();
@@ -145,7 +175,7 @@ fn for_each(args: &Args, mut take: impl FnMut(&cantap::TraceRecord)) -> anyhow::
             take(record);
         }
     }
-    Ok(first_ns)
+    Ok(Read { first_ns, missing: records.missing(), not_drawn: 0 })
 }
 
 /// The plot with the date of its beginning on its axis.

@@ -14,6 +14,8 @@ use cantap::{Channel, Device, TraceEvent, TraceFrame};
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::input::ReadArgs;
+use crate::meter::rounded;
+use crate::missing::Missing;
 use crate::sending::Sending;
 use crate::wrong::wrong;
 use crate::{args, interrupt};
@@ -59,7 +61,7 @@ pub struct Args {
     #[arg(long, default_value_t = 1.0, value_parser = speed)]
     speed: f64,
     /// End after this many frames.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// Wait for Enter before the first frame.
     #[arg(short, long)]
@@ -172,27 +174,29 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut replay = Replay::new(&device, pace, bitrates_bps)?;
     let mut sending = Sending::new(&device, args.open.rescue(), !args.verbose);
     let started = Instant::now();
-    let Played { asked, left_out, fd_left_out } =
+    let Played { asked, left_out, fd_left_out, missing } =
         args.play(&source, &mut replay, &mut sending, &mut buses)?;
     let seconds = started.elapsed().as_secs_f64();
     let outcome = sending.outcome(asked)?;
     device.stop()?;
     let accuracy = replay.accuracy();
     if args.json {
-        writeln!(
-            std::io::stdout(),
-            "{}",
-            serde_json::json!({
-                "frames": sending.sent(),
-                "failed": outcome.not_sent(),
-                "reason": outcome.reason(),
-                "left_out": left_out,
-                "fd_left_out": fd_left_out,
-                "seconds": seconds,
-                "early_us": accuracy.early_us,
-                "late_us": accuracy.late_us,
-            })
-        )?;
+        let mut object = outcome.object();
+        object["sent"] = sending.sent().into();
+        object["seconds"] = rounded(seconds, 3).into();
+        object["early_us"] = accuracy.early_us.into();
+        object["late_us"] = accuracy.late_us.into();
+        let not_sent = object["left_out"].take();
+        missing.put_into(&mut object);
+        for (reason, count) in not_sent.as_object().into_iter().flatten() {
+            object["left_out"][reason] = count.clone();
+        }
+        for (kind, count) in [(OTHER_CHANNELS, left_out), (FD, fd_left_out)] {
+            if count > 0 {
+                object["left_out"][kind] = count.into();
+            }
+        }
+        writeln!(std::io::stdout(), "{object}")?;
     } else {
         eprint!("cantap: {} frames in {seconds:.1} s", sending.sent());
         if left_out > 0 {
@@ -223,7 +227,13 @@ struct Played {
     left_out: u64,
     /// CAN FD frames, which the device cannot send.
     fd_left_out: u64,
+    /// What of the file was not read in the last round.
+    missing: Missing,
 }
+
+/// Kinds of frames that are left out, as the JSON object has them.
+const OTHER_CHANNELS: &str = "frames of channels that nothing is sent to";
+const FD: &str = "CAN FD frames, which the device cannot send";
 
 /// What is played, and where to.
 struct Source {
@@ -341,6 +351,7 @@ impl Args {
                     source.input.display()
                 );
             }
+            played.missing = records.missing();
             round += 1;
             shift_ns = last_ns + 1_000_000;
             if let (true, Rounds::Times(rounds)) = (sending.has_stopped(), self.rounds) {

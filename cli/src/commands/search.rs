@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use cantap::{TraceEvent, TraceRecord};
-use cantap_formats::{TraceWriter, WriteOptions, create_writer};
+use cantap_formats::WriteOptions;
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
 use cantap_signals::{Decoder, SignalValue};
@@ -16,8 +16,10 @@ use cantap_trace::Interface;
 use super::decode;
 use crate::databases::DatabaseArgs;
 use crate::exit;
-use crate::input::ReadArgs;
+use crate::input::{ReadArgs, Records};
 use crate::live::LiveArgs;
+use crate::missing::Missing;
+use crate::trace_output::TraceOutput;
 use crate::words::{error_name, failure_name, state_name};
 
 /// The command line.
@@ -70,7 +72,7 @@ pub struct Args {
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
-    /// One JSON object per record.
+    /// Print one JSON object per record, and behind them one with the summary.
     #[arg(long)]
     json: bool,
     /// Leave out what is wrong with databases that can be used, and which of them replaces another.
@@ -94,9 +96,10 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         anyhow::bail!("nothing to look for; give --id, --data or a condition (see cantap search --help)");
     }
     let search = Search { ids: args.ids.clone(), data: args.data.clone(), condition };
-    let mut sink = Sink::new(args, decoder)?;
-    let found = find(args, search, &mut sink)?;
-    sink.finish()?;
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
+    let mut sink = Sink::new(args, decoder, records.grows())?;
+    let found = find(args, &mut records, search, &mut sink)?;
+    sink.finish(found, &records.missing())?;
     if args.count {
         writeln!(std::io::stdout(), "{found}")?;
     }
@@ -104,10 +107,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Goes through the trace and hands on what was found with its context; returns how many were.
-fn find(args: &Args, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
+fn find(args: &Args, records: &mut Records, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
     let (mut found, mut still_after) = (0, 0);
     // Whether something lies between the last record shown and the next.
@@ -153,14 +155,15 @@ enum Kind {
     Nowhere,
     Text(BufWriter<std::io::Stdout>),
     Json(BufWriter<std::io::Stdout>),
-    Trace(Box<dyn TraceWriter>),
+    Trace(TraceOutput),
 }
 
 impl Sink {
-    fn new(args: &Args, decoder: Decoder) -> anyhow::Result<Self> {
+    /// What `grows` is written as it comes.
+    fn new(args: &Args, decoder: Decoder, grows: bool) -> anyhow::Result<Self> {
         let stdout = || BufWriter::with_capacity(1 << 16, std::io::stdout());
         let kind = match (&args.output, args.count, args.json) {
-            (Some(path), ..) => Kind::Trace(create_writer(path, &WriteOptions::default())?),
+            (Some(path), ..) => Kind::Trace(TraceOutput::create(path, &WriteOptions::default(), grows)?),
             (_, true, _) => Kind::Nowhere,
             (_, _, true) => Kind::Json(stdout()),
             _ => Kind::Text(stdout()),
@@ -176,7 +179,7 @@ impl Sink {
         }
     }
 
-    fn show(&mut self, record: &TraceRecord, found: bool) -> std::io::Result<()> {
+    fn show(&mut self, record: &TraceRecord, found: bool) -> anyhow::Result<()> {
         let message =
             record.frame().and_then(|frame| self.decoder.decode(record.channel, frame, &mut self.values));
         let message = message.map(|message| self.decoder.message(message));
@@ -194,7 +197,7 @@ impl Sink {
                     write!(out, "  {}:", message.name)?;
                     decode::write_values(out, message, &self.values)?;
                 }
-                writeln!(out)
+                Ok(writeln!(out)?)
             }
             Kind::Json(out) => {
                 let mut object = serde_json::json!({
@@ -210,25 +213,29 @@ impl Sink {
                 if let Some(message) = message {
                     object["message"] = message.name.as_str().into();
                 }
-                writeln!(out, "{object}")
+                Ok(writeln!(out, "{object}")?)
             }
         }
     }
 
-    fn flush(&mut self) -> std::io::Result<()> {
+    fn flush(&mut self) -> anyhow::Result<()> {
         match &mut self.kind {
             Kind::Nowhere => Ok(()),
-            Kind::Text(out) | Kind::Json(out) => out.flush(),
+            Kind::Text(out) | Kind::Json(out) => Ok(out.flush()?),
             Kind::Trace(writer) => writer.flush(),
         }
     }
 
-    fn finish(mut self) -> std::io::Result<()> {
+    /// The last line, where scripts read, and what a file could not carry.
+    fn finish(mut self, found: u64, missing: &Missing) -> anyhow::Result<()> {
+        if let Kind::Json(out) = &mut self.kind {
+            let mut summary = serde_json::json!({ "found": found });
+            missing.put_into(&mut summary);
+            writeln!(out, "{}", serde_json::json!({ "summary": summary }))?;
+        }
         self.flush()?;
-        if let Kind::Trace(writer) = self.kind {
-            for (what, count) in writer.finish()?.iter() {
-                eprintln!("cantap: the file's format cannot carry {what}: {count} left out");
-            }
+        if let Kind::Trace(output) = self.kind {
+            output.finish()?;
         }
         Ok(())
     }

@@ -16,7 +16,7 @@ use cantap::{Channel, Device};
 use self::report::{Outcome, Report};
 use crate::address::{Address, OpenDevice};
 use crate::boards::OneBoard;
-use crate::{args, exit, interrupt};
+use crate::{args, beside, exit, interrupt};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -25,7 +25,7 @@ use crate::{args, exit, interrupt};
                         themselves inside the controller.\nWith --loop both channels send, so that nothing else may be connected: channel 1 \
                         to channel 2, CANH to CANH, CANL to CANL, and 120 ohms at each end.\nA step passes, fails, or is skipped with the \
                         reason. Exit code 3 if one fails. What to do by hand besides is in docs/bring-up.md.\n\n\
-                        Examples:\n  cantap selftest -d /dev/ttyACM0 --report board.txt\n  cantap selftest -d COM5 --loop --seconds 60\n  \
+                        Examples:\n  cantap selftest -d /dev/ttyACM0 --report board.txt\n  cantap selftest -d COM5 --loop --load-time 1m\n  \
                         cantap selftest -d virtual:wire=joined,load=0 --loop --json"
 )]
 pub struct Args {
@@ -35,8 +35,8 @@ pub struct Args {
     #[arg(long = "loop")]
     looped: bool,
     /// How long each saturating load lasts, as 5s or 2m.
-    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = args::positive_duration)]
-    seconds: Duration,
+    #[arg(long, alias = "seconds", value_name = "TIME", default_value = "5s", value_parser = args::positive_duration)]
+    load_time: Duration,
     /// Restart the firmware at the end, and see it come back.
     #[arg(long)]
     restart: bool,
@@ -62,7 +62,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     restart(args, &address, device, &serial, &mut report);
     report.finish();
     if let Some(path) = &args.report {
-        std::fs::write(path, report.text()?)
+        beside::write(path, report.text()?.as_bytes())
             .with_context(|| format!("'{}' cannot be written; choose another place", path.display()))?;
     }
     if args.json {
@@ -91,7 +91,7 @@ fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
         let name = format!("channel {} transmit queue", channel.number());
         report.step(&name, || buses::fill_queue(device, channel));
     }
-    report.step("both channels saturated, each by itself", || buses::saturate(device, false, args.seconds));
+    report.step("both channels saturated, each by itself", || buses::saturate(device, false, args.load_time));
     if args.looped {
         for bitrate_bps in BITRATES_BPS {
             report.step(&format!("channel 1 to channel 2 and back, {bitrate_bps} bit/s"), || {
@@ -102,7 +102,7 @@ fn test(args: &Args, address: &Address, device: &Device, report: &mut Report) {
             let name = format!("channel {} without an acknowledgement", sender.number());
             report.step(&name, || buses::unacknowledged(device, sender));
         }
-        report.step("both channels saturate one bus", || buses::saturate(device, true, args.seconds));
+        report.step("both channels saturate one bus", || buses::saturate(device, true, args.load_time));
     } else {
         report.step("channel 1 to channel 2", || {
             Ok(Outcome::Skip("they are not said to be wired to each other (--loop)".to_owned()))
@@ -140,7 +140,7 @@ mod tests {
     /// How often each channel put a dominant level on its bus.
     fn driven(line: &str, options: &str) -> [u64; 2] {
         let args = Line::parse_from(
-            ["x", "-d", "virtual", "--seconds", "100ms"].into_iter().chain(line.split_whitespace()),
+            ["x", "-d", "virtual", "--load-time", "100ms"].into_iter().chain(line.split_whitespace()),
         )
         .args;
         let connection = start(options.parse::<Options>().unwrap()).unwrap();

@@ -46,10 +46,10 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     /// Send again and again, by the device's own timer, at least 47us apart.
-    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    #[arg(long, value_name = "TIME", value_parser = args::duration)]
     period: Option<Duration>,
     /// How many times each frame is sent. Without --period and --on-rx they follow one another at once.
-    #[arg(short = 'n', long, value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     count: Option<u32>,
     /// Send when a frame is received that this filter accepts: ID, or ID:MASK as in candump.
     #[arg(long, value_name = "FILTER", conflicts_with = "period")]
@@ -58,7 +58,7 @@ pub struct Args {
     #[arg(long, conflicts_with_all = ["period", "on_rx"])]
     reply: bool,
     /// End after this time. Without it and --count, periodic frames and replies go on until Ctrl-C.
-    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     #[command(flatten)]
     modifiers: modifiers::ModifierArgs,
@@ -84,7 +84,7 @@ fn channel(text: &str) -> Result<Channel, String> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Everything that can be wrong on the line is found before anything is sent.
-    let frames = args.frames()?;
+    let (frames, faults) = args.frames()?;
     let triggers = args.triggers(&frames)?;
     let periodic = args.periodic(&frames)?;
     interrupt::watch()?;
@@ -134,6 +134,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         object["channel"] = args.channel.number().into();
         object["sent"] = sending.sent().into();
         object["seconds"] = rounded(seconds, 3).into();
+        object["issues"] = faults.into();
         writeln!(std::io::stdout().lock(), "{object}")?;
     }
     outcome.verdict()?;
@@ -141,7 +142,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 impl Args {
-    fn frames(&self) -> anyhow::Result<Vec<Frame>> {
+    /// The frames, and how many places of the databases are wrong.
+    fn frames(&self) -> anyhow::Result<(Vec<Frame>, usize)> {
         // A colon stands in no frame and in every message with values.
         let is_message = |text: &String| text.contains(':') && !text.contains('#');
         let device = self.device.given().filter(|_| self.frames.iter().any(is_message));
@@ -154,7 +156,8 @@ impl Args {
                 Ok(frame.map_err(|error| wrong(format!("'{text}' is no frame: {error}")))?)
             }
         };
-        self.frames.iter().map(frame).collect()
+        let frames = self.frames.iter().map(frame).collect::<anyhow::Result<_>>()?;
+        Ok((frames, database.faults()))
     }
 
     /// The period and what changes each time, if frames are to be sent periodically.

@@ -16,7 +16,8 @@ use self::windows::Windows;
 use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::input::{Missing, ReadArgs};
+use crate::input::ReadArgs;
+use crate::missing::{Missing, by_kind};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -44,7 +45,7 @@ pub struct Args {
     /// repeated. Without it a channel with switched bit rates has no load.
     #[arg(
         long = "data-bitrate",
-        value_name = "[CHANNEL:]BITRATE",
+        value_name = "[CHANNEL:]RATE",
         conflicts_with = "device",
         requires = "bitrates"
     )]
@@ -56,13 +57,13 @@ pub struct Args {
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.
-    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
     window: Duration,
     /// List every window.
     #[arg(long)]
     windows: bool,
     /// List every identifier with count, period, jitter and DLCs.
-    #[arg(short, long)]
+    #[arg(long)]
     per_id: bool,
     /// Print one JSON object, identifiers included.
     #[arg(long)]
@@ -85,7 +86,11 @@ impl Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let live = if args.input.is_some() { None } else { Some(live::open(args)?) };
+    let live = if args.input.is_some() {
+        None
+    } else {
+        Some(live::open(&args.device, &args.channel, &args.bitrates, args.time)?)
+    };
     let mut options = args.options();
     if let Some(live) = &live {
         options.channel_bitrate_bps = live.bit_rates();
@@ -95,7 +100,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut ended = Ok(());
     let mut missing = Missing::default();
     if let Some(mut live) = live {
-        ended = live::run(args, &mut live, &mut statistics, &mut windows);
+        ended = live::run(!args.json, &mut live, &mut statistics, &mut windows);
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {
@@ -143,7 +148,7 @@ fn write_json(
 ) -> anyhow::Result<()> {
     let object = serde_json::to_string(summary)?;
     let members = object.strip_suffix('}').context("a summary is an object")?;
-    let (issues, left_out) = (missing.issues, serde_json::to_string(&missing.by_kind())?);
+    let (issues, left_out) = (missing.issues, serde_json::to_string(&by_kind(&missing.left_out))?);
     let share = missing.share_pct();
     let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };

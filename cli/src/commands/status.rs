@@ -27,7 +27,7 @@ pub struct Args {
     #[command(flatten)]
     device: OneBoard,
     /// Open the channels for so long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
-    #[arg(short, long, value_name = "TIME", value_parser = args::duration)]
+    #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.
     #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels_of_one)]

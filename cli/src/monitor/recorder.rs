@@ -13,7 +13,7 @@ use super::model::Recording;
 use crate::advice;
 
 /// What is kept around an event where a condition is given.
-const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, once: false };
+const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, events: None };
 
 /// What stands between a file's name and the condition on which it is written.
 const IF: &str = " if ";

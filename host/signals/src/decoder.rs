@@ -34,6 +34,7 @@ pub struct Decoder {
     common: Lookup,
     by_channel: HashMap<u8, Lookup>,
     overrides: Vec<Override>,
+    faults: usize,
 }
 
 /// Messages of one database that a later one of the same channel describes too, and otherwise.
@@ -123,6 +124,7 @@ impl Decoder {
         let mut by_channel = HashMap::new();
         let mut messages: Vec<(Option<u8>, Message, MessagePlan)> = Vec::new();
         let mut overrides: Vec<Override> = Vec::new();
+        let faults = sources.iter().map(|source| source.database.warnings.len()).sum();
         // Each database's file and first message.
         let mut files: Vec<(u32, String)> = Vec::new();
         for Source { channel, database } in sources {
@@ -147,7 +149,12 @@ impl Decoder {
             }
             files.push((own, database.file));
         }
-        Self { messages, common, by_channel, overrides }
+        Self { messages, common, by_channel, overrides, faults }
+    }
+
+    /// How many places of the databases are wrong (see [`Database::warnings`]).
+    pub const fn faults(&self) -> usize {
+        self.faults
     }
 
     /// Messages that a later database of the same channel replaces.

@@ -23,8 +23,8 @@ pub struct Window {
     pub pre_ns: i64,
     /// How long after the event records are kept, in nanoseconds.
     pub post_ns: i64,
-    /// Only the first event counts: those after it do not lengthen the time.
-    pub once: bool,
+    /// Only so many events count: those after them do not lengthen the time. All without it.
+    pub events: Option<u64>,
 }
 
 /// What happened so far.
@@ -83,7 +83,7 @@ impl Trigger {
         self.forget_before(now_ns.saturating_sub(self.window.pre_ns));
         let holds = self.condition.holds(record);
         let is_event = holds && (!self.held || self.condition.is_about_frames());
-        if is_event && !(self.window.once && self.counts.events > 0) {
+        if is_event && self.window.events.is_none_or(|most| self.counts.events < most) {
             self.counts.events += 1;
             self.counts.forgotten += self.overflowed.drain(..).map(|(_, count)| count).sum::<u64>();
             self.open_until_ns = Some(now_ns.saturating_add(self.window.post_ns));
@@ -175,7 +175,7 @@ mod tests {
         let condition = Condition::new(condition, &decoder).unwrap();
         Trigger::with_capacity(
             condition,
-            Window { pre_ns: pre * SECOND, post_ns: post * SECOND, once: false },
+            Window { pre_ns: pre * SECOND, post_ns: post * SECOND, events: None },
             capacity,
         )
     }
@@ -207,7 +207,7 @@ mod tests {
     #[test]
     fn the_only_event_that_counts_is_over_though_others_follow() {
         let mut once = trigger("byte[0] >= 10", 2, 3, 100);
-        once.window.once = true;
+        once.window.events = Some(1);
         assert_eq!(kept(&mut once, 0..30), [8, 9, 10, 11, 12, 13]);
         assert_eq!(once.counts().events, 1);
         assert!(!once.is_open());

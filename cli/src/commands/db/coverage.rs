@@ -2,13 +2,12 @@
 
 use std::collections::HashMap;
 use std::io::Write;
-use std::path::Path;
 
 use cantap_analysis::stats::{IdStatistics, Options, Statistics};
 use cantap_signals::{Database, Decoder, MessageRef, Source};
 use serde_json::json;
 
-use super::Args;
+use crate::input::Records;
 use crate::words::counted;
 
 /// A cycle counts as another one than the database says if it differs by more than this share.
@@ -35,15 +34,20 @@ impl Heard {
     }
 }
 
-/// Compares and prints.
-pub fn run(args: &Args, databases: Vec<Database>, trace: &Path, out: &mut impl Write) -> anyhow::Result<()> {
+/// Compares with a trace and prints.
+pub fn run(
+    databases: Vec<Database>,
+    j1939: bool,
+    mut records: Records,
+    json: bool,
+    out: &mut impl Write,
+) -> anyhow::Result<()> {
     let sources = databases.into_iter().map(|database| Source { channel: None, database });
     let mut decoder = Decoder::new(sources.collect());
-    if args.j1939 {
+    if j1939 {
         decoder.assume_j1939();
     }
     let mut statistics = Statistics::new(Options::default())?;
-    let mut records = args.read.open(trace)?;
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
         for record in &batch {
@@ -76,7 +80,7 @@ pub fn run(args: &Args, databases: Vec<Database>, trace: &Path, out: &mut impl W
         let mean = heard.mean_ms?;
         Some(((mean - nominal) / nominal).abs() > TOLERANCE)
     };
-    if args.json {
+    if json {
         let entry = |heard: &Heard| json!({ "channel": heard.channel, "id": heard.id, "frames": heard.frames, "period_mean_ms": heard.mean_ms, "period_max_ms": heard.max_ms });
         let missing: Vec<_> = unknown.iter().map(entry).collect();
         let silent: Vec<_> = never
@@ -93,10 +97,11 @@ pub fn run(args: &Args, databases: Vec<Database>, trace: &Path, out: &mut impl W
                 object
             })
             .collect();
-        let object = json!({
+        let mut object = json!({
             "frames": frames, "covered": covered, "unlisted": unlisted,
             "not_in_database": missing, "never_came": silent, "messages": cycles,
         });
+        records.missing().put_into(&mut object);
         return Ok(writeln!(out, "{object}")?);
     }
     let share = if frames > 0 { covered as f64 * 100.0 / frames as f64 } else { 0.0 };

@@ -5,12 +5,16 @@ use std::io::Write;
 use cantap_signals::{ByteOrder, Database, Message, Selection, Signal, Suggestion, ValueKind};
 use serde_json::{Value, json};
 
-use super::Args;
 use crate::words::counted;
 
 /// Shows the messages that were asked for.
-pub fn run(args: &Args, databases: &[Database], out: &mut impl Write) -> anyhow::Result<()> {
-    let patterns: Vec<_> = args.messages.iter().map(|text| Wanted::of(text)).collect::<Result<_, _>>()?;
+pub fn run(
+    messages: &[String],
+    json: bool,
+    databases: &[Database],
+    out: &mut impl Write,
+) -> anyhow::Result<()> {
+    let patterns: Vec<_> = messages.iter().map(|text| Wanted::of(text)).collect::<Result<_, _>>()?;
     for wanted in &patterns {
         if !databases.iter().flat_map(|database| &database.messages).any(|message| wanted.matches(message)) {
             let names = databases.iter().flat_map(|database| &database.messages);
@@ -20,7 +24,7 @@ pub fn run(args: &Args, databases: &[Database], out: &mut impl Write) -> anyhow:
     }
     let chosen = |message: &&Message| patterns.iter().any(|wanted| wanted.matches(message));
     let mut found = databases.iter().flat_map(|database| &database.messages).filter(chosen);
-    if args.json {
+    if json {
         let messages: Vec<_> = found.map(as_json).collect();
         return Ok(writeln!(out, "{}", json!({ "messages": messages }))?);
     }

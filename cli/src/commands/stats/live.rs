@@ -1,13 +1,15 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
-use std::time::{SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cantap_analysis::stats::{Statistics, Window};
 
-use super::Args;
 use super::table::remarks;
 use super::windows::Windows;
+use crate::address::Address;
+use crate::args::Channels;
 use crate::boards::Boards;
+use crate::channel_bitrate::ChannelBitrate;
 use crate::live::LiveRecords;
 use crate::stderr;
 
@@ -17,40 +19,50 @@ const LATENESS_NS: i64 = 1_000_000_000;
 const BAR_COLUMNS: usize = 20;
 
 /// Opens the devices that the command line names, else the one that is connected.
-pub(super) fn open(args: &Args) -> anyhow::Result<LiveRecords> {
-    let boards = Boards::new(&args.device, &args.channel)
+pub(super) fn open(
+    devices: &[Address],
+    channels: &Channels,
+    bitrates: &[ChannelBitrate],
+    time: Option<Duration>,
+) -> anyhow::Result<LiveRecords> {
+    let boards = Boards::new(devices, channels)
         .map_err(|error| error.context("without a trace to measure, a device is listened to"))?;
-    LiveRecords::listen(&boards, &args.bitrates, args.time)
+    LiveRecords::listen(&boards, bitrates, time)
 }
 
-/// Listens until Ctrl-C or the end of the time. What was heard counts, even where this fails.
+/// Listens until Ctrl-C or the end of the time, and prints a line per window if `shown`. What was heard counts, even where this
+/// fails.
 pub(super) fn run(
-    args: &Args,
+    shown: bool,
     live: &mut LiveRecords,
     statistics: &mut Statistics,
     windows: &mut Option<Windows>,
 ) -> anyhow::Result<()> {
-    let mut show = Lines::new(!args.json);
+    let mut show = Lines::new(shown);
     let mut keep = |window: &Window| {
         show.window(window);
         if let Some(windows) = windows {
             windows.push(window);
         }
     };
-    let mut batch = Vec::new();
-    let ended = loop {
-        match live.next_batch(&mut batch) {
-            Ok(true) => {}
-            Ok(false) => break Ok(()),
-            Err(error) => break Err(error),
-        }
-        for record in &batch {
-            statistics.push_with(record, &mut keep);
-        }
-        statistics.advance_with(now_ns().saturating_sub(LATENESS_NS), &mut keep);
-    };
+    let ended = listen(live, statistics, &mut keep);
     statistics.finish_with(&mut keep);
     ended
+}
+
+fn listen(
+    live: &mut LiveRecords,
+    statistics: &mut Statistics,
+    keep: &mut impl FnMut(&Window),
+) -> anyhow::Result<()> {
+    let mut batch = Vec::new();
+    while live.next_batch(&mut batch)? {
+        for record in &batch {
+            statistics.push_with(record, &mut *keep);
+        }
+        statistics.advance_with(now_ns().saturating_sub(LATENESS_NS), &mut *keep);
+    }
+    Ok(())
 }
 
 /// The machine's UTC time, which the device's is mapped to.

@@ -4,7 +4,7 @@ use std::fmt::Write as _;
 
 use cantap_analysis::stats::{ChannelSummary, IdSummary, PeakSummary, Summary};
 
-use crate::input::Missing;
+use crate::missing::Missing;
 
 /// Everything, for a terminal of any width above eighty columns.
 pub(super) fn text(summary: &Summary, missing: &Missing, per_id: bool) -> String {

@@ -1,0 +1,221 @@
+//! What a capture says of itself at its end: one object for scripts, lines for people.
+
+use std::io::{self, Write};
+use std::path::Path;
+
+use cantap::device::{Gaps, channel_number};
+use cantap_signals::trigger::{Trigger, TriggerCounts};
+
+use crate::address::Address;
+use crate::boards::Boards;
+use crate::live::{Line, LiveRecords};
+use crate::losses::Losses;
+use crate::meter::{Meter, rounded};
+
+/// A channel in the JSON object.
+#[derive(serde::Serialize)]
+pub struct ChannelSummary {
+    pub channel: u8,
+    pub frames: u64,
+    lost: u64,
+    /// Reported and suppressed ones, whatever the filters.
+    pub bus_errors: u64,
+    /// `null` where the device left out what it takes to know it, as the next one.
+    frames_per_s: Option<f64>,
+    bus_load_pct: Option<f64>,
+}
+
+/// The JSON object.
+#[derive(serde::Serialize)]
+pub struct Summary {
+    seconds: f64,
+    pub channels: Vec<ChannelSummary>,
+    lost: Losses,
+    clock_drift_ppm: Option<f64>,
+    /// If there are several.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    devices: Vec<DeviceSummary>,
+    /// If there were any.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    gaps: Option<GapSummary>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub trigger: Option<TriggerSummary>,
+    /// After a failure: how many of the frames the file has.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub frames_in_file: Option<u64>,
+}
+
+/// One of several devices.
+#[derive(serde::Serialize)]
+struct DeviceSummary {
+    device: String,
+    channels: Vec<u8>,
+    clock_drift_ppm: Option<f64>,
+    /// Whether its times are on the first device's clock by USB frames.
+    by_usb_frames: bool,
+    /// Why not.
+    no_usb_frames_because: Option<String>,
+    /// From when on, in seconds since the Unix epoch.
+    by_usb_frames_since_s: Option<f64>,
+    /// How far its own round trips had put its times off by then.
+    moved_us: f64,
+    /// How far off the first device's its times may be without USB frames.
+    uncertainty_us: Option<f64>,
+}
+
+/// Times in which the device was not there. The frames of that time are in no count.
+#[derive(serde::Serialize)]
+struct GapSummary {
+    count: u32,
+    seconds: f64,
+}
+
+/// What a trigger did.
+#[derive(serde::Serialize)]
+pub struct TriggerSummary {
+    events: u64,
+    kept: u64,
+    forgotten: u64,
+}
+
+impl TriggerSummary {
+    /// As far as it came.
+    pub fn of(trigger: &Trigger) -> Self {
+        let TriggerCounts { events, kept, forgotten } = trigger.counts();
+        Self { events, kept, forgotten }
+    }
+}
+
+impl Summary {
+    /// Of what these devices heard in so many seconds, by channel; neither a trigger nor a file is known of yet.
+    pub fn of(seconds: f64, channels: Vec<ChannelSummary>, live: &LiveRecords, boards: &Boards) -> Self {
+        let gaps = live.lines().lines().map(Line::gaps);
+        let gaps = gaps.fold(Gaps::default(), |sum, gaps| Gaps {
+            count: sum.count + gaps.count,
+            time: sum.time + gaps.time,
+        });
+        let counters = live.lines().lines().map(Line::counters);
+        Self {
+            seconds: rounded(seconds, 3),
+            channels,
+            lost: counters.map(|counters| Losses::of(&counters)).fold(Losses::default(), Losses::plus),
+            clock_drift_ppm: live.lines().lines().next().and_then(drift_ppm),
+            devices: devices(live, boards),
+            gaps: (gaps.count > 0)
+                .then(|| GapSummary { count: gaps.count, seconds: rounded(gaps.time.as_secs_f64(), 3) }),
+            trigger: None,
+            frames_in_file: None,
+        }
+    }
+
+    /// Prints it: the object, or lines on standard error. `output` is the file that was written.
+    pub fn tell(&self, json: bool, output: Option<&Path>) -> anyhow::Result<()> {
+        if json {
+            writeln!(io::stdout().lock(), "{}", serde_json::to_string(self)?)?;
+            return Ok(());
+        }
+        eprintln!("captured {} s", self.seconds);
+        for channel in &self.channels {
+            eprintln!("{}", channel.line());
+        }
+        if let Some(TriggerSummary { events, kept, forgotten }) = &self.trigger {
+            eprintln!("trigger: {events} events, {kept} records kept");
+            if *forgotten > 0 {
+                eprintln!("{forgotten} records before events were too many to remember; use a shorter --pre");
+            }
+        }
+        let frames: u64 = self.channels.iter().map(|channel| channel.frames).sum();
+        if let (Some(path), Some(in_file)) =
+            (output, self.frames_in_file.filter(|in_file| *in_file != frames))
+        {
+            eprintln!("{in_file} of the {frames} frames are in '{}'", path.display());
+        }
+        eprintln!("lost: {}", self.lost.line());
+        if let Some(GapSummary { count, seconds }) = &self.gaps {
+            eprintln!(
+                "gaps: {count}, {seconds} s in which the device was not there: what was on the bus then nobody counted"
+            );
+        }
+        if let Some(ppm) = self.clock_drift_ppm {
+            let how = if ppm < 0.0 { "slower" } else { "faster" };
+            eprintln!("the device's clock runs {} ppm {how} than this computer's", ppm.abs());
+        }
+        for device in self.devices.iter().skip(1) {
+            eprintln!("{}", device.line());
+        }
+        Ok(())
+    }
+}
+
+fn drift_ppm(line: &Line) -> Option<f64> {
+    line.clock().drift_ppm.map(|ppm| rounded(ppm, 2))
+}
+
+/// What is known of several devices' clocks; nothing of one, which is its own.
+fn devices(live: &LiveRecords, boards: &Boards) -> Vec<DeviceSummary> {
+    if live.addresses().len() < 2 {
+        return Vec::new();
+    }
+    let uncertainty_ns = |line: &Line| line.clock().uncertainty_ns;
+    let first_ns = live.lines().lines().next().and_then(uncertainty_ns);
+    let mut followers = live.lines().clocks();
+    let summary = |(board, (line, address)): (usize, (&Line, &Address))| {
+        let clock = if board == 0 { None } else { followers.next() };
+        let common = clock.map_or(Ok(()), |clock| clock.common);
+        let apart_ns = common.is_err().then(|| Some(first_ns? + uncertainty_ns(line)?)).flatten();
+        DeviceSummary {
+            device: address.to_string(),
+            channels: boards.channels_of(board).map(|channel| channel_number(board, channel)).collect(),
+            clock_drift_ppm: drift_ppm(line),
+            by_usb_frames: common.is_ok(),
+            no_usb_frames_because: common.err().map(|reason| reason.to_string()),
+            by_usb_frames_since_s: clock.and_then(|clock| clock.since_ns).map(|ns| ns as f64 / 1e9),
+            moved_us: clock.map_or(0.0, |clock| clock.moved_ns as f64 / 1e3),
+            uncertainty_us: apart_ns.map(|ns| ns as f64 / 1e3),
+        }
+    };
+    live.lines().lines().zip(live.addresses()).enumerate().map(summary).collect()
+}
+
+impl DeviceSummary {
+    /// How well its times are on the first device's clock, for people.
+    fn line(&self) -> String {
+        let Self { device, moved_us, uncertainty_us, .. } = self;
+        let channels: Vec<String> = self.channels.iter().map(u8::to_string).collect();
+        let clock = match (&self.no_usb_frames_because, self.by_usb_frames_since_s) {
+            (None, Some(_)) => {
+                format!(
+                    "on the first device's clock by USB frames (its own round trips were {moved_us} us off)"
+                )
+            }
+            (None, None) => "coming to the first device's clock by USB frames".to_owned(),
+            (Some(reason), _) => {
+                let known = uncertainty_us.map_or(String::new(), |us| format!(", to {us:.0} us or better"));
+                format!("on the first device's clock by UTC alone{known}: {reason}")
+            }
+        };
+        format!("channels {} of '{device}': {clock}", channels.join(" and "))
+    }
+}
+
+impl ChannelSummary {
+    /// Of a channel with this number.
+    pub fn of(channel: u8, meter: &Meter) -> Self {
+        Self {
+            channel,
+            frames: meter.frames(),
+            lost: meter.lost(),
+            bus_errors: meter.bus_errors(),
+            frames_per_s: meter.frames_per_s().map(|rate| rounded(rate, 1)),
+            bus_load_pct: meter.bus_load_pct().map(|load| rounded(load, 2)),
+        }
+    }
+
+    /// One line, without what is not known.
+    fn line(&self) -> String {
+        let Self { channel, frames, lost, bus_errors, frames_per_s, bus_load_pct } = self;
+        let rate = frames_per_s.map_or_else(String::new, |rate| format!(", {rate} frames/s"));
+        let load = bus_load_pct.map_or_else(String::new, |load| format!(", bus load {load} %"));
+        format!("channel {channel}: {frames} frames{rate}{load}, {lost} lost, {bus_errors} bus errors")
+    }
+}

@@ -1,0 +1,117 @@
+//! `cantap conversations`: what the frames mean.
+
+mod json;
+mod summary;
+mod surveyed;
+
+use std::io::{BufWriter, Write};
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use cantap_protocols::iso_tp::Pair;
+use cantap_protocols::{Conversations, Event, Options, Protocol};
+use cantap_trace::Interface;
+
+use self::summary::Summary;
+use self::surveyed::Surveyed;
+use super::decode::Seconds;
+use crate::input::ReadArgs;
+use crate::live::LiveArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap conversations drive.log\n  \
+    cantap conversations drive.blf --protocol uds --protocol obd --json\n  \
+    cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
+    cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
+Without --protocol, each channel is read by the protocols that its first frames show, which are named on\n\
+standard error. A line is: time, interface, protocol, sender > receiver, what was said, and for a response\n\
+how long it took. Where frames were lost, what was under way says so. With --json each line is an object:\n\
+{\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", …}, see docs/protocols.md.")]
+pub struct Args {
+    /// The trace; - for standard input.
+    #[arg(value_name = "FILE")]
+    input: Option<PathBuf>,
+    #[command(flatten)]
+    live: LiveArgs,
+    /// Only this protocol, on every channel: isotp, uds, kwp2000 or obd. Several with commas, or repeated. isotp
+    /// alone shows transfers as they are.
+    #[arg(short, long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
+    protocols: Vec<Protocol>,
+    /// Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as
+    /// 6F1/12:612/F1. Can be repeated. Others are found by what they do.
+    #[arg(long = "pair", value_name = "ID:ID")]
+    pairs: Vec<Pair>,
+    /// Only what went wrong: refusals, requests without a response, transfers that broke.
+    #[arg(long)]
+    faults: bool,
+    /// One JSON object per line.
+    #[arg(long)]
+    json: bool,
+    /// Leave out the summary.
+    #[arg(short, long)]
+    quiet: bool,
+    #[command(flatten)]
+    read: ReadArgs,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
+    let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
+    let mut surveyed = Surveyed::new(args.protocols.is_empty());
+    let mut conversations = None;
+    let mut summary = Summary::default();
+    let (mut batch, mut events) = (Vec::new(), Vec::new());
+    loop {
+        let more = records.next_batch(&mut batch)?;
+        // Until it is clear what is spoken, records wait.
+        if conversations.is_none() && surveyed.take(&mut batch, more) {
+            let found = surveyed.found();
+            if !args.quiet {
+                surveyed::tell(found.as_deref());
+            }
+            let (protocols, pairs) = (args.protocols.clone(), args.pairs.clone());
+            conversations = Some(Conversations::new(Options { protocols, pairs, spoken: found }));
+            batch = surveyed.release();
+        }
+        if let Some(conversations) = &mut conversations {
+            for record in &batch {
+                summary.record(record);
+                conversations.take(record, &mut events);
+            }
+            if !more {
+                conversations.finish(&mut events);
+            }
+        }
+        for event in events.drain(..) {
+            summary.event(&event);
+            if !args.faults || is_fault(&event) {
+                write(&mut out, &event, args.json)?;
+            }
+        }
+        if !more {
+            break;
+        }
+        if records.may_wait() {
+            out.flush()?;
+        }
+    }
+    out.flush()?;
+    if !args.quiet {
+        summary.tell();
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn is_fault(event: &Event) -> bool {
+    event.trouble.is_some() || event.frames_lost || event.kind == "refusal"
+}
+
+fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
+    if json {
+        return json::write(out, event);
+    }
+    writeln!(out, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
+}

@@ -1,0 +1,53 @@
+//! What there was, in a few lines on standard error.
+
+use std::collections::BTreeMap;
+
+use cantap::{TraceEvent, TraceRecord};
+use cantap_protocols::{Event, Protocol};
+
+/// Counts.
+#[derive(Default)]
+pub(super) struct Summary {
+    frames: u64,
+    lost: u64,
+    gaps: u64,
+    /// Of each protocol: events, and those in which something went wrong.
+    events: BTreeMap<Protocol, (u64, u64)>,
+}
+
+impl Summary {
+    pub fn record(&mut self, record: &TraceRecord) {
+        match record.event {
+            TraceEvent::Frame { .. } => self.frames += 1,
+            TraceEvent::Lost { count, .. } => {
+                self.lost += u64::from(count);
+                self.gaps += 1;
+            }
+            _ => {}
+        }
+    }
+
+    pub fn event(&mut self, event: &Event) {
+        let (all, faults) = self.events.entry(event.protocol).or_default();
+        *all += 1;
+        *faults += u64::from(super::is_fault(event));
+    }
+
+    pub fn tell(&self) {
+        let mut said = Vec::new();
+        for (protocol, (all, faults)) in &self.events {
+            said.push(match faults {
+                0 => format!("{all} {protocol}"),
+                faults => format!("{all} {protocol} ({faults} with a fault)"),
+            });
+        }
+        let said =
+            if said.is_empty() { "nothing that a protocol explains".to_owned() } else { said.join(", ") };
+        eprintln!("cantap: {} frames: {said}", self.frames);
+        if self.gaps > 0 {
+            let lost =
+                if self.lost == 0 { "frames".to_owned() } else { format!("{} frames or more", self.lost) };
+            eprintln!("cantap: {lost} are missing in the trace, at {} places", self.gaps);
+        }
+    }
+}

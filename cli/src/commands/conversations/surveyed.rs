@@ -1,0 +1,70 @@
+//! What a bus speaks is told by its beginning, which is read by it as well: its records wait meanwhile.
+
+use cantap::TraceRecord;
+use cantap_protocols::{Evidence, Survey};
+
+/// No survey looks at more records than this.
+const MOST_RECORDS: usize = 200_000;
+/// Nor at more than this time of the bus, in nanoseconds.
+const LONGEST_NS: i64 = 3_000_000_000;
+
+/// Records that wait for the survey.
+pub(super) struct Surveyed {
+    survey: Option<Survey>,
+    waiting: Vec<TraceRecord>,
+}
+
+impl Surveyed {
+    /// Without a survey, nothing waits.
+    pub fn new(is_wanted: bool) -> Self {
+        Self { survey: is_wanted.then(Survey::new), waiting: Vec::new() }
+    }
+
+    /// Takes the records and leaves none; whether the survey is done.
+    pub fn take(&mut self, records: &mut Vec<TraceRecord>, more: bool) -> bool {
+        let Some(survey) = &mut self.survey else {
+            self.waiting.append(records);
+            return true;
+        };
+        for record in records.iter() {
+            survey.take(record);
+        }
+        self.waiting.append(records);
+        let spans = match (self.waiting.first(), self.waiting.last()) {
+            (Some(first), Some(last)) => last.time_ns.saturating_sub(first.time_ns),
+            _ => 0,
+        };
+        !more || self.waiting.len() >= MOST_RECORDS || spans >= LONGEST_NS
+    }
+
+    /// What each channel speaks; `None` without a survey.
+    pub fn found(&self) -> Option<Vec<Evidence>> {
+        self.survey.as_ref().map(Survey::found)
+    }
+
+    /// The records that waited.
+    pub fn release(&mut self) -> Vec<TraceRecord> {
+        std::mem::take(&mut self.waiting)
+    }
+}
+
+/// Says what was found.
+pub(super) fn tell(found: Option<&[Evidence]>) {
+    let Some(found) = found else { return };
+    if found.is_empty() {
+        eprintln!(
+            "cantap: no protocol is known by its first frames; name one with --protocol to read the trace by it"
+        );
+        return;
+    }
+    let mut channels: Vec<(u8, Vec<&str>)> = Vec::new();
+    for Evidence { channel, protocol, .. } in found {
+        match channels.last_mut().filter(|(last, _)| last == channel) {
+            Some((_, names)) => names.push(protocol.name()),
+            None => channels.push((*channel, vec![protocol.name()])),
+        }
+    }
+    for (channel, names) in channels {
+        eprintln!("cantap: channel {channel} speaks {}", names.join(", "));
+    }
+}

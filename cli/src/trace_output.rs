@@ -1,0 +1,65 @@
+//! A trace that a command writes.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use cantap::TraceRecord;
+use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+
+use crate::beside::Beside;
+
+/// A trace being written. An older file of its name stays as it is until this one is whole.
+pub struct TraceOutput {
+    path: PathBuf,
+    writer: Box<dyn TraceWriter>,
+    beside: Option<Beside>,
+}
+
+impl TraceOutput {
+    /// Begins the file. What `grows`, as what comes from a bus, is for others to read meanwhile: it is written in place, as are
+    /// files that follow one another.
+    pub fn create(path: &Path, options: &WriteOptions, grows: bool) -> anyhow::Result<Self> {
+        let is_whole = options.rotation.at.is_empty() && !grows;
+        let beside = if is_whole { Beside::of(path) } else { None };
+        let written = beside.as_ref().map_or(path, |beside| &beside.temporary);
+        let writer = create_writer(written, options).with_context(|| failed(path))?;
+        Ok(Self { path: path.to_owned(), writer, beside })
+    }
+
+    /// Adds a record.
+    pub fn write(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
+        self.writer.write(record).with_context(|| failed(&self.path))
+    }
+
+    /// Writes what waits in memory.
+    pub fn flush(&mut self) -> anyhow::Result<()> {
+        self.writer.flush().with_context(|| failed(&self.path))
+    }
+
+    /// Ends the file and puts it in its place. Says what it could not carry, and returns it.
+    pub fn finish(self) -> anyhow::Result<LeftOut> {
+        let left_out = self.writer.finish().with_context(|| failed(&self.path))?;
+        if let Some(beside) = self.beside {
+            beside.put_in_place().with_context(|| failed(&self.path))?;
+        }
+        report(&left_out, &self.path);
+        Ok(left_out)
+    }
+}
+
+/// How a file is called in messages.
+pub fn shown(path: &Path) -> String {
+    if path.as_os_str() == "-" { "standard output".to_owned() } else { path.display().to_string() }
+}
+
+/// Says what a finished file could not carry.
+pub fn report(left_out: &LeftOut, path: &Path) {
+    for (what, count) in left_out.iter() {
+        eprintln!("cantap: {} does not carry {what} ({count})", shown(path));
+    }
+}
+
+/// What is said where it cannot be written.
+pub fn failed(path: &Path) -> String {
+    format!("cannot write {}", shown(path))
+}

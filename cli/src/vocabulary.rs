@@ -1,0 +1,137 @@
+//! One meaning for each option, in every command: held by walking the command line that clap knows. What commands print is held in
+//! `tests/vocabulary.rs`.
+
+use std::collections::BTreeMap;
+
+use clap::{Arg, ArgAction, Command, CommandFactory};
+
+use crate::Cli;
+
+/// The option that a letter is short for.
+const LETTERS: [(char, &[&str]); 20] = [
+    ('A', &["after-context"]),
+    ('B', &["before-context"]),
+    ('C', &["context"]),
+    ('b', &["bitrate"]),
+    ('c', &["channel"]),
+    ('d', &["device"]),
+    ('e', &["condition"]),
+    ('f', &["filter"]),
+    ('h', &["help"]),
+    ('i', &["id"]),
+    ('m', &["max-count"]),
+    // How many frames.
+    ('n', &["frames", "count"]),
+    ('o', &["output"]),
+    ('p', &["profile"]),
+    ('q', &["quiet"]),
+    ('s', &["signal"]),
+    // How long.
+    ('t', &["time"]),
+    ('v', &["verbose"]),
+    ('w', &["window"]),
+    ('y', &["yes"]),
+];
+
+/// Letters of can-utils, which users of `cangen` and `canplayer` type without looking.
+const OF_CAN_UTILS: [(&str, &str); 2] = [("gen", "DEILRcefgimpx8"), ("replay", "Igilstx")];
+
+/// Options whose values are not told by their name alone, and why.
+const MANY_KINDS: [(&str, &str); 6] = [
+    ("count", "as in grep, search counts instead of printing; send's is a number"),
+    ("id", "gen makes identifiers, search looks for them"),
+    ("loop", "replay's number of rounds, as canplayer's; selftest's wiring"),
+    ("data", "gen makes data, search looks for them"),
+    ("length", "gen's alone"),
+    ("check", "diff says whether, align how much"),
+];
+
+/// Calls `see` with each command that does something, by its whole name, and each of its options.
+fn each(command: &Command, name: &str, see: &mut impl FnMut(&str, &Arg)) {
+    for argument in command.get_arguments() {
+        see(name, argument);
+    }
+    for below in command.get_subcommands() {
+        each(below, format!("{name} {}", below.get_name()).trim_start(), see);
+    }
+}
+
+#[test]
+fn a_letter_means_one_thing_in_every_command() {
+    let mut wrong = Vec::new();
+    each(&Cli::command(), "", &mut |command, argument| {
+        let Some(letter) = argument.get_short() else { return };
+        let meant = LETTERS.iter().find(|(known, _)| *known == letter).map_or(&[][..], |(_, names)| names);
+        let long = argument.get_long().unwrap_or_default();
+        let own = OF_CAN_UTILS.iter().any(|(own, letters)| *own == command && letters.contains(letter));
+        if !own && !meant.contains(&long) {
+            wrong.push(format!("{command}: -{letter}, --{long}"));
+        }
+    });
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+#[test]
+fn a_name_takes_one_kind_of_value_in_every_command() {
+    let mut kinds: BTreeMap<String, BTreeMap<String, Vec<String>>> = BTreeMap::new();
+    each(&Cli::command(), "", &mut |command, argument| {
+        let Some(long) = argument.get_long().filter(|long| MANY_KINDS.iter().all(|(name, _)| name != long))
+        else {
+            return;
+        };
+        // A value for all channels, or for one.
+        let values = argument.get_value_names().unwrap_or_default().join(" ").replace("[CHANNEL:]", "");
+        let takes = matches!(argument.get_action(), ArgAction::Set | ArgAction::Append);
+        let kind = if takes { values } else { "nothing".to_owned() };
+        kinds.entry(long.to_owned()).or_default().entry(kind).or_default().push(command.to_owned());
+    });
+    kinds.retain(|_, kinds| kinds.len() > 1);
+    assert!(kinds.is_empty(), "{kinds:#?}");
+}
+
+/// `10` is ten seconds everywhere but in `gen` and `replay`, whose gaps are milliseconds as in can-utils; and says so.
+#[test]
+fn every_time_is_written_as_the_others() {
+    let mut seen = 0;
+    each(&Cli::command(), "", &mut |command, argument| {
+        let is_time = argument.get_value_names().unwrap_or_default().iter().any(|name| name == "TIME");
+        // Points in time have a language of their own.
+        let is_point = matches!(argument.get_long(), Some("start" | "end"));
+        if !is_time || is_point {
+            return;
+        }
+        seen += 1;
+        let parse = |text: &str| {
+            // Its parser alone: what else it needs beside it is no part of a time.
+            let line = Arg::new("time").long("time").value_parser(argument.get_value_parser().clone());
+            let parser = Command::new("x").arg(line);
+            parser.try_get_matches_from(["x", "--time", text]).map(|_| ())
+        };
+        for good in ["2", "2s"] {
+            assert!(parse(good).is_ok(), "{command} {argument}: {good}: {}", parse(good).unwrap_err());
+        }
+        for bad in ["fast", "-1", "2 parsecs"] {
+            assert!(parse(bad).is_err(), "{command} {argument}: {bad}");
+        }
+    });
+    assert!(seen > 15, "{seen}");
+}
+
+/// What is asked for in every object of what was measured can be asked for everywhere.
+#[test]
+fn what_measures_or_tells_has_json() {
+    let mut without = Vec::new();
+    let line = Cli::command();
+    for command in line.get_subcommands() {
+        let has =
+            |command: &Command| command.get_arguments().any(|argument| argument.get_long() == Some("json"));
+        if !has(command) && !command.get_subcommands().any(has) {
+            without.push(command.get_name().to_owned());
+        }
+    }
+    without.sort();
+    // They write scripts or files, act, or show a screen.
+    let expected =
+        ["completions", "identify", "man", "monitor", "reset", "update", "virtual"].map(str::to_owned);
+    assert_eq!(without, expected);
+}

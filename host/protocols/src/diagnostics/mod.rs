@@ -1,0 +1,311 @@
+//! Diagnostics: UDS (ISO 14229), KWP2000 services (ISO 14230-3) and OBD-II (SAE J1979), over ISO 15765-2.
+//!
+//! A request and its response are one event. What nobody answers, what nobody asked for, and transfers that break are events of
+//! their own.
+//!
+//! Memory: that of [`crate::iso_tp`], and 256 requests that wait for their responses.
+
+mod dtc;
+mod names;
+mod obd;
+#[cfg(test)]
+mod tests;
+mod uds;
+
+pub use dtc::Dtc;
+pub use names::{data_identifier, reason, uds_service};
+
+use std::borrow::Cow;
+use std::collections::VecDeque;
+
+use cantap_trace::TraceRecord;
+use rustc_hash::FxHashSet;
+
+use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+
+/// Requests that wait for a response at the same time.
+const MOST_WAITING: usize = 256;
+/// How long a response is waited for. ISO 14229-2 has 50 ms for the server and as much again for the network as a client grants; this is
+/// what no client exceeds.
+const RESPONSE_NS: i64 = 2_000_000_000;
+/// And after the server has said that the response is pending: P2* is 5 s by default.
+const PENDING_NS: i64 = 10_000_000_000;
+const RESPONSE_PENDING: u8 = 0x78;
+/// Senders that are known to speak KWP2000.
+const MOST_KWP: usize = 1024;
+
+/// A request that waits.
+#[derive(Clone, Debug)]
+struct Waiting {
+    request: Transfer,
+    /// How often the server said that the response is pending, and when last.
+    pending: u32,
+    until_ns: i64,
+    /// Responses so far; a request to all may have several.
+    answers: u32,
+    frames_lost: bool,
+}
+
+/// Turns transfers into requests with their responses.
+#[derive(Clone, Debug, Default)]
+pub struct Diagnostics {
+    transport: Transport,
+    waiting: VecDeque<Waiting>,
+    /// Both sides of those who used a service that only KWP2000 has.
+    speaks_kwp: FxHashSet<(u8, Endpoint)>,
+    transfers: Vec<Transfer>,
+}
+
+impl Diagnostics {
+    /// With pairs that are known on all channels; `finds` looks for others.
+    pub fn new(pairs: &[Pair], finds: bool) -> Self {
+        Self { transport: Transport::new(pairs, finds), ..Self::default() }
+    }
+
+    fn transfer(&mut self, transfer: Transfer, events: &mut Vec<Event>) {
+        let Some(&sid) = transfer.data.first().filter(|_| transfer.is_whole()) else {
+            events.push(transfer.into());
+            return;
+        };
+        if sid == 0x7F && transfer.data.len() >= 3 {
+            self.refusal(&transfer, events);
+        } else if sid & 0x40 == 0 && self.service(&transfer, sid).is_some() {
+            self.request(transfer, events);
+        } else if sid & 0x40 != 0 && self.service(&transfer, sid & !0x40).is_some() {
+            self.response(&transfer, events);
+        } else {
+            events.push(transfer.into());
+        }
+    }
+
+    /// The protocol and name of a service on this transfer's pair.
+    fn service(&self, transfer: &Transfer, sid: u8) -> Option<(Protocol, Cow<'static, str>)> {
+        if names::obd_service(sid).is_some() {
+            return Some((Protocol::Obd, obd::title(sid).into()));
+        }
+        if let Some(name) = names::kwp_only_service(sid) {
+            return Some((Protocol::Kwp2000, name.into()));
+        }
+        if !self.speaks_kwp.is_empty() && self.speaks_kwp.contains(&(transfer.channel, transfer.from)) {
+            return names::kwp_service(sid).map(|name| (Protocol::Kwp2000, name.into()));
+        }
+        names::uds_service(sid).map(|name| (Protocol::Uds, name.into()))
+    }
+
+    fn request(&mut self, mut transfer: Transfer, events: &mut Vec<Event>) {
+        let sid = transfer.data[0];
+        if names::kwp_only_service(sid).is_some() && self.speaks_kwp.len() < MOST_KWP {
+            self.speaks_kwp.insert((transfer.channel, transfer.from));
+            self.speaks_kwp.extend(transfer.to.map(|to| (transfer.channel, to)));
+        }
+        transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
+        let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
+        if is_uds && uds::is_response_suppressed(&transfer.data) {
+            let mut event = self.event(&transfer, None, "request");
+            event.fields.push(Field::text("response", "not wanted"));
+            events.push(event);
+            return;
+        }
+        // Who asks again does not wait for the first answer any longer.
+        let same = |waiting: &Waiting| {
+            (waiting.request.channel, waiting.request.from, waiting.request.to)
+                == (transfer.channel, transfer.from, transfer.to)
+        };
+        if let Some(place) = self.waiting.iter().position(same) {
+            self.give_up(place, Trouble::Overlapped, events);
+        }
+        if self.waiting.len() == MOST_WAITING {
+            self.give_up(0, Trouble::GivenUp, events);
+        }
+        let until_ns = transfer.time_ns.saturating_add(RESPONSE_NS);
+        let frames_lost = transfer.frames_lost;
+        self.waiting.push_back(Waiting { request: transfer, pending: 0, until_ns, answers: 0, frames_lost });
+    }
+
+    /// The request that a response to `sid` is for.
+    fn asked(&self, response: &Transfer, sid: u8) -> Option<usize> {
+        let of_channel = |waiting: &Waiting| {
+            waiting.request.channel == response.channel && waiting.request.data.first() == Some(&sid)
+        };
+        let physical = |waiting: &Waiting| of_channel(waiting) && waiting.request.to == Some(response.from);
+        let functional = |waiting: &Waiting| {
+            of_channel(waiting)
+                && waiting.request.to.is_none()
+                && waiting.request.from.id.is_extended() == response.from.id.is_extended()
+        };
+        self.waiting.iter().position(physical).or_else(|| self.waiting.iter().position(functional))
+    }
+
+    fn response(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
+        match self.asked(transfer, transfer.data[0] & !0x40) {
+            Some(place) => {
+                let answered = self.answered(place);
+                events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
+            }
+            None => events.push(self.unasked(transfer)),
+        }
+    }
+
+    /// The request as it was until now; one to a single server waits no longer.
+    fn answered(&mut self, place: usize) -> Waiting {
+        let waiting = &mut self.waiting[place];
+        waiting.answers += 1;
+        let answered = waiting.clone();
+        if waiting.request.to.is_some() {
+            self.waiting.remove(place);
+        }
+        answered
+    }
+
+    fn refusal(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
+        let (sid, nrc) = (transfer.data[1], transfer.data[2]);
+        let Some(place) = self.asked(transfer, sid) else {
+            events.push(self.unasked(transfer));
+            return;
+        };
+        if nrc == RESPONSE_PENDING {
+            let waiting = &mut self.waiting[place];
+            waiting.pending += 1;
+            waiting.until_ns = transfer.time_ns.saturating_add(PENDING_NS);
+            return;
+        }
+        let answered = self.answered(place);
+        let mut event = self.event(&answered.request, Some((transfer, &answered)), "exchange");
+        event.kind = "refusal";
+        events.push(event);
+    }
+
+    /// A response whose request was not heard.
+    fn unasked(&self, transfer: &Transfer) -> Event {
+        let mut event = self.event(transfer, None, "response");
+        event.fields.push(Field::text("request", "not heard"));
+        event
+    }
+
+    /// One transfer, or a request with its response, as an event.
+    fn event(&self, first: &Transfer, response: Option<(&Transfer, &Waiting)>, kind: &'static str) -> Event {
+        let refused = |data: &[u8]| data[0] == 0x7F && data.len() >= 3;
+        let sid = if refused(&first.data) { first.data[1] } else { first.data[0] & !0x40 };
+        let (protocol, title) =
+            self.service(first, sid).unwrap_or_else(|| (Protocol::Uds, format!("service {sid:02X}").into()));
+        let mut fields = vec![Field::hex("sid", sid, 2)];
+        let is_request = first.data[0] & 0x40 == 0;
+        if is_request {
+            // What an OBD response repeats of the request is shown once.
+            let positive = response.is_some_and(|(response, _)| !refused(&response.data));
+            match protocol {
+                Protocol::Obd if positive && matches!(sid, 1 | 2 | 9) => {}
+                Protocol::Obd => obd::request(sid, &first.data[1..], &mut fields),
+                Protocol::Kwp2000 => uds::kwp_request(&first.data, &mut fields),
+                _ => uds::request(&first.data, &mut fields),
+            }
+        }
+        let answer = response.map(|(response, _)| response).or((!is_request).then_some(first));
+        if let Some(answer) = answer {
+            let data = &answer.data;
+            if refused(data) {
+                fields.push(Field::hex("nrc", data[2], 2).meaning(Some(reason(data[2]))));
+            } else {
+                match protocol {
+                    Protocol::Obd => obd::response(sid, &data[1..], &mut fields),
+                    Protocol::Kwp2000 => uds::kwp_response(is_request, data, &mut fields),
+                    _ => uds::response(is_request.then_some(&first.data), data, &mut fields),
+                }
+            }
+        }
+        let mut event = Event {
+            time_ns: first.time_ns,
+            start_ns: first.start_ns,
+            channel: first.channel,
+            protocol,
+            from: first.from.into(),
+            to: first.to.map_or(Party::Everyone, Party::from),
+            kind,
+            title,
+            fields,
+            data: first.data.clone(),
+            response_ns: None,
+            frames: first.frames,
+            trouble: None,
+            frames_lost: first.frames_lost,
+        };
+        if !is_request && first.to.is_none() {
+            event.to = Party::Unknown;
+        }
+        if let Some((response, waiting)) = response {
+            if waiting.pending > 0 {
+                event.fields.push(Field::number("pending", waiting.pending).unit("times"));
+            }
+            // To all: who answered is what matters.
+            if first.to.is_none() {
+                event.to = response.from.into();
+                event.fields.push(Field::text("asked", "all"));
+            }
+            event.time_ns = response.time_ns;
+            event.response_ns = Some(response.start_ns.saturating_sub(first.time_ns));
+            event.frames += response.frames;
+            event.frames_lost |= waiting.frames_lost || response.frames_lost;
+            event.data.clone_from(&response.data);
+        }
+        event
+    }
+
+    /// Nobody answers the request at this place any more.
+    fn give_up(&mut self, place: usize, trouble: Trouble, events: &mut Vec<Event>) {
+        let Some(waiting) = self.waiting.remove(place) else { return };
+        if waiting.answers > 0 {
+            return;
+        }
+        let mut event = self.event(&waiting.request, None, "no_response");
+        event.fields.push(Field::text("response", "none"));
+        if waiting.pending > 0 {
+            event.fields.push(Field::number("pending", waiting.pending).unit("times"));
+        }
+        if let Trouble::Timeout { .. } = trouble {
+            event.time_ns = waiting.until_ns;
+        }
+        event.trouble = Some(trouble);
+        event.frames_lost |= waiting.frames_lost;
+        events.push(event);
+    }
+
+    fn expire(&mut self, now_ns: i64, events: &mut Vec<Event>) {
+        while let Some(place) = self.waiting.iter().position(|waiting| waiting.until_ns < now_ns) {
+            let waiting = &self.waiting[place];
+            let waited = if waiting.pending > 0 { PENDING_NS } else { RESPONSE_NS };
+            self.give_up(place, Trouble::Timeout { after_ms: (waited / 1_000_000) as u32 }, events);
+        }
+    }
+}
+
+impl Assembler for Diagnostics {
+    fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
+        if self.waiting.front().is_some_and(|waiting| waiting.until_ns < record.time_ns) {
+            self.expire(record.time_ns, events);
+        }
+        if is_gap(&record.event) {
+            for waiting in self.waiting.iter_mut().filter(|waiting| waiting.request.channel == record.channel)
+            {
+                waiting.frames_lost = true;
+            }
+        }
+        let mut transfers = std::mem::take(&mut self.transfers);
+        self.transport.take(record, &mut |transfer| transfers.push(transfer));
+        for transfer in transfers.drain(..) {
+            self.transfer(transfer, events);
+        }
+        self.transfers = transfers;
+    }
+
+    fn finish(&mut self, events: &mut Vec<Event>) {
+        let mut transfers = std::mem::take(&mut self.transfers);
+        self.transport.finish(&mut |transfer| transfers.push(transfer));
+        for transfer in transfers {
+            self.transfer(transfer, events);
+        }
+        while !self.waiting.is_empty() {
+            self.give_up(0, Trouble::Unfinished, events);
+        }
+    }
+}

@@ -1,0 +1,414 @@
+//! OBD-II: what the services of SAE J1979 carry, with values in their units.
+
+use std::fmt::Write as _;
+
+use super::dtc;
+use super::names;
+use crate::{Field, Value};
+
+/// A parameter whose value is a line: `(raw * scale) + offset`.
+struct Line {
+    pid: u8,
+    bytes: u8,
+    name: &'static str,
+    unit: &'static str,
+    scale: f64,
+    offset: f64,
+    signed: bool,
+}
+
+const PERCENT: f64 = 100.0 / 255.0;
+const TRIM: f64 = 100.0 / 128.0;
+
+const fn line(pid: u8, bytes: u8, name: &'static str, unit: &'static str, scale: f64, offset: f64) -> Line {
+    Line { pid, bytes, name, unit, scale, offset, signed: false }
+}
+
+/// SAE J1979-DA, by the formulas that are public.
+const LINES: [Line; 64] = [
+    line(0x04, 1, "calculated_load", "%", PERCENT, 0.0),
+    line(0x05, 1, "coolant_temperature", "°C", 1.0, -40.0),
+    line(0x06, 1, "short_term_fuel_trim_bank_1", "%", TRIM, -100.0),
+    line(0x07, 1, "long_term_fuel_trim_bank_1", "%", TRIM, -100.0),
+    line(0x08, 1, "short_term_fuel_trim_bank_2", "%", TRIM, -100.0),
+    line(0x09, 1, "long_term_fuel_trim_bank_2", "%", TRIM, -100.0),
+    line(0x0A, 1, "fuel_pressure", "kPa", 3.0, 0.0),
+    line(0x0B, 1, "intake_manifold_pressure", "kPa", 1.0, 0.0),
+    line(0x0C, 2, "engine_speed", "rpm", 0.25, 0.0),
+    line(0x0D, 1, "vehicle_speed", "km/h", 1.0, 0.0),
+    line(0x0E, 1, "timing_advance", "°", 0.5, -64.0),
+    line(0x0F, 1, "intake_air_temperature", "°C", 1.0, -40.0),
+    line(0x10, 2, "air_flow", "g/s", 0.01, 0.0),
+    line(0x11, 1, "throttle_position", "%", PERCENT, 0.0),
+    line(0x1F, 2, "run_time", "s", 1.0, 0.0),
+    line(0x21, 2, "distance_with_mil_on", "km", 1.0, 0.0),
+    line(0x22, 2, "fuel_rail_pressure_relative", "kPa", 0.079, 0.0),
+    line(0x23, 2, "fuel_rail_gauge_pressure", "kPa", 10.0, 0.0),
+    line(0x2C, 1, "commanded_egr", "%", PERCENT, 0.0),
+    line(0x2D, 1, "egr_error", "%", TRIM, -100.0),
+    line(0x2E, 1, "commanded_evaporative_purge", "%", PERCENT, 0.0),
+    line(0x2F, 1, "fuel_level", "%", PERCENT, 0.0),
+    line(0x30, 1, "warm_ups_since_cleared", "", 1.0, 0.0),
+    line(0x31, 2, "distance_since_cleared", "km", 1.0, 0.0),
+    Line { signed: true, ..line(0x32, 2, "evaporative_system_pressure", "Pa", 0.25, 0.0) },
+    line(0x33, 1, "barometric_pressure", "kPa", 1.0, 0.0),
+    line(0x3C, 2, "catalyst_temperature_bank_1_sensor_1", "°C", 0.1, -40.0),
+    line(0x3D, 2, "catalyst_temperature_bank_2_sensor_1", "°C", 0.1, -40.0),
+    line(0x3E, 2, "catalyst_temperature_bank_1_sensor_2", "°C", 0.1, -40.0),
+    line(0x3F, 2, "catalyst_temperature_bank_2_sensor_2", "°C", 0.1, -40.0),
+    line(0x42, 2, "control_module_voltage", "V", 0.001, 0.0),
+    line(0x43, 2, "absolute_load", "%", PERCENT, 0.0),
+    line(0x44, 2, "commanded_lambda", "", 2.0 / 65_536.0, 0.0),
+    line(0x45, 1, "relative_throttle_position", "%", PERCENT, 0.0),
+    line(0x46, 1, "ambient_air_temperature", "°C", 1.0, -40.0),
+    line(0x47, 1, "absolute_throttle_position_b", "%", PERCENT, 0.0),
+    line(0x48, 1, "absolute_throttle_position_c", "%", PERCENT, 0.0),
+    line(0x49, 1, "accelerator_pedal_position_d", "%", PERCENT, 0.0),
+    line(0x4A, 1, "accelerator_pedal_position_e", "%", PERCENT, 0.0),
+    line(0x4B, 1, "accelerator_pedal_position_f", "%", PERCENT, 0.0),
+    line(0x4C, 1, "commanded_throttle_actuator", "%", PERCENT, 0.0),
+    line(0x4D, 2, "time_with_mil_on", "min", 1.0, 0.0),
+    line(0x4E, 2, "time_since_cleared", "min", 1.0, 0.0),
+    line(0x52, 1, "ethanol_fuel", "%", PERCENT, 0.0),
+    line(0x53, 2, "absolute_evaporative_pressure", "kPa", 0.005, 0.0),
+    Line { signed: true, ..line(0x54, 2, "evaporative_system_pressure_wide", "Pa", 1.0, 0.0) },
+    line(0x59, 2, "fuel_rail_absolute_pressure", "kPa", 10.0, 0.0),
+    line(0x5A, 1, "relative_accelerator_pedal_position", "%", PERCENT, 0.0),
+    line(0x5B, 1, "hybrid_battery_remaining", "%", PERCENT, 0.0),
+    line(0x5C, 1, "oil_temperature", "°C", 1.0, -40.0),
+    line(0x5D, 2, "fuel_injection_timing", "°", 1.0 / 128.0, -210.0),
+    line(0x5E, 2, "fuel_rate", "L/h", 0.05, 0.0),
+    line(0x61, 1, "demanded_torque", "%", 1.0, -125.0),
+    line(0x62, 1, "actual_torque", "%", 1.0, -125.0),
+    line(0x63, 2, "reference_torque", "Nm", 1.0, 0.0),
+    line(0x8E, 1, "friction_torque", "%", 1.0, -125.0),
+    line(0xA6, 4, "odometer", "km", 0.1, 0.0),
+    line(0x1C, 1, "obd_standard", "", 1.0, 0.0),
+    line(0x51, 1, "fuel_type", "", 1.0, 0.0),
+    line(0x5F, 1, "emission_requirements", "", 1.0, 0.0),
+    line(0x12, 1, "secondary_air_status", "", 1.0, 0.0),
+    line(0x13, 1, "oxygen_sensors_present", "", 1.0, 0.0),
+    line(0x1D, 1, "oxygen_sensors_present_4_banks", "", 1.0, 0.0),
+    line(0x1E, 1, "auxiliary_input", "", 1.0, 0.0),
+];
+
+const FUELS: [&str; 24] = [
+    "not available",
+    "petrol",
+    "methanol",
+    "ethanol",
+    "diesel",
+    "LPG",
+    "CNG",
+    "propane",
+    "electric",
+    "bifuel running petrol",
+    "bifuel running methanol",
+    "bifuel running ethanol",
+    "bifuel running LPG",
+    "bifuel running CNG",
+    "bifuel running propane",
+    "bifuel running electricity",
+    "bifuel running electric and combustion engine",
+    "hybrid petrol",
+    "hybrid ethanol",
+    "hybrid diesel",
+    "hybrid electric",
+    "hybrid running electric and combustion engine",
+    "hybrid regenerative",
+    "bifuel running diesel",
+];
+
+const STANDARDS: [&str; 14] = [
+    "",
+    "OBD II (CARB)",
+    "OBD (EPA)",
+    "OBD and OBD II",
+    "OBD I",
+    "not OBD compliant",
+    "EOBD",
+    "EOBD and OBD II",
+    "EOBD and OBD",
+    "EOBD, OBD and OBD II",
+    "JOBD",
+    "JOBD and OBD II",
+    "JOBD and EOBD",
+    "JOBD, EOBD and OBD II",
+];
+
+fn number(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
+}
+
+/// Data bytes of a parameter of service 01; `None` if it is not known here.
+fn length(pid: u8) -> Option<usize> {
+    if pid.is_multiple_of(0x20) {
+        return Some(4);
+    }
+    let known = LINES.iter().find(|line| line.pid == pid).map(|line| usize::from(line.bytes));
+    known.or(match pid {
+        0x01 | 0x24..=0x2B | 0x34..=0x3B | 0x41 | 0x4F | 0x50 => Some(4),
+        0x02 | 0x03 | 0x14..=0x1B | 0x55..=0x58 => Some(2),
+        0x64 => Some(5),
+        _ => None,
+    })
+}
+
+/// What a parameter is called.
+pub fn name(pid: u8) -> Option<&'static str> {
+    let known = LINES.iter().find(|line| line.pid == pid).map(|line| line.name);
+    known.or(match pid {
+        _ if pid.is_multiple_of(0x20) => Some("supported"),
+        0x01 => Some("monitor_status"),
+        0x02 => Some("freeze_frame_code"),
+        0x03 => Some("fuel_system_status"),
+        0x14..=0x1B => Some("oxygen_sensor_voltage"),
+        0x24..=0x2B => Some("oxygen_sensor_lambda_voltage"),
+        0x34..=0x3B => Some("oxygen_sensor_lambda_current"),
+        0x41 => Some("monitor_status_this_cycle"),
+        0x4F => Some("maximum_values"),
+        0x50 => Some("maximum_air_flow"),
+        0x55..=0x58 => Some("secondary_oxygen_sensor_trim"),
+        0x64 => Some("torque_data"),
+        _ => None,
+    })
+}
+
+/// The parameter's values.
+fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
+    if let Some(line) = LINES.iter().find(|line| line.pid == pid) {
+        let raw = number(bytes);
+        let value = if line.signed { f64::from(raw as u16 as i16) } else { raw as f64 };
+        // As the standard has it: added before nothing else is done to the number.
+        let text = match pid {
+            0x51 => FUELS.get(raw as usize).copied(),
+            0x1C => STANDARDS.get(raw as usize).copied().filter(|text| !text.is_empty()),
+            _ => None,
+        };
+        fields.push(Field::real(line.name, value * line.scale + line.offset, line.unit).meaning(text));
+        return;
+    }
+    let word = |at: usize| number(&bytes[at..at + 2]) as f64;
+    let byte = |at: usize| f64::from(bytes[at]);
+    match pid {
+        _ if pid.is_multiple_of(0x20) => fields.push(Field::text("supported", supported(pid, bytes))),
+        0x01 | 0x41 => {
+            fields.push(Field::text("mil", if bytes[0] & 0x80 == 0 { "off" } else { "on" }));
+            fields.push(Field::number("trouble_codes", bytes[0] & 0x7F));
+            fields.push(Field::bytes("monitors", &bytes[1..]));
+        }
+        0x02 => fields.push(Field::text("freeze_frame_code", dtc::list(bytes))),
+        0x03 => fields.push(Field::bytes("fuel_system_status", bytes)),
+        0x14..=0x1B => {
+            fields.push(Field::real("oxygen_sensor_voltage", byte(0) / 200.0, "V"));
+            if bytes[1] != 0xFF {
+                fields.push(Field::real("short_term_fuel_trim", byte(1) * TRIM - 100.0, "%"));
+            }
+        }
+        0x24..=0x2B => {
+            fields.push(Field::real("lambda", word(0) * 2.0 / 65_536.0, ""));
+            fields.push(Field::real("oxygen_sensor_voltage", word(2) * 8.0 / 65_536.0, "V"));
+        }
+        0x34..=0x3B => {
+            fields.push(Field::real("lambda", word(0) * 2.0 / 65_536.0, ""));
+            fields.push(Field::real("oxygen_sensor_current", word(2) / 256.0 - 128.0, "mA"));
+        }
+        0x4F => {
+            let parts = [
+                ("lambda", 1.0, ""),
+                ("oxygen_sensor_voltage", 1.0, "V"),
+                ("oxygen_sensor_current", 1.0, "mA"),
+            ];
+            for (at, (name, scale, unit)) in parts.into_iter().enumerate() {
+                fields.push(Field::real(format!("maximum_{name}"), byte(at) * scale, unit));
+            }
+            fields.push(Field::real("maximum_intake_manifold_pressure", byte(3) * 10.0, "kPa"));
+        }
+        0x50 => fields.push(Field::real("maximum_air_flow", byte(0) * 10.0, "g/s")),
+        0x55..=0x58 => {
+            for (at, bank) in ["a", "b"].into_iter().enumerate() {
+                let name = format!("secondary_oxygen_sensor_trim_{bank}");
+                fields.push(Field::real(name, byte(at) * TRIM - 100.0, "%"));
+            }
+        }
+        0x64 => {
+            for (at, point) in ["idle", "1", "2", "3", "4"].into_iter().enumerate() {
+                fields.push(Field::real(format!("torque_{point}"), byte(at) - 125.0, "%"));
+            }
+        }
+        _ => fields.push(Field::bytes("value", bytes)),
+    }
+}
+
+/// The numbers whose bits are set.
+fn supported(first: u8, bytes: &[u8]) -> String {
+    let bits = number(bytes);
+    let mut text = String::new();
+    for bit in 0..32_u8 {
+        if bits >> (31 - bit) & 1 == 1 {
+            // Writing to a String cannot fail.
+            let _ =
+                write!(text, "{}{:02X}", if text.is_empty() { "" } else { " " }, first.wrapping_add(bit + 1));
+        }
+    }
+    text
+}
+
+/// What a request asks for, behind the service byte.
+pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
+    match sid {
+        1 | 2 => {
+            let step = usize::from(sid);
+            for pid in rest.chunks(step).map(|chunk| chunk[0]) {
+                fields.push(Field::hex("pid", pid, 2).meaning(name(pid)));
+            }
+        }
+        9 => {
+            for pid in rest {
+                fields.push(Field::hex("pid", *pid, 2).meaning(info_name(*pid)));
+            }
+        }
+        _ if !rest.is_empty() => fields.push(Field::bytes("parameters", rest)),
+        _ => {}
+    }
+}
+
+const fn info_name(pid: u8) -> Option<&'static str> {
+    Some(match pid {
+        0x00 => "supported",
+        0x02 => "VIN",
+        0x04 => "calibration identifications",
+        0x06 => "calibration verification numbers",
+        0x08 => "in-use performance, spark ignition",
+        0x0A => "ECU name",
+        0x0B => "in-use performance, compression ignition",
+        0x0D => "engine serial number",
+        0x0F => "exhaust regulation or type approval number",
+        _ => return None,
+    })
+}
+
+/// What a response says, behind the service byte; the request has no fields of its own then.
+pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
+    match sid {
+        1 | 2 => {
+            while let Some((&pid, after)) = rest.split_first() {
+                fields.push(Field::hex("pid", pid, 2).meaning(name(pid)));
+                let mut after = after;
+                if sid == 2
+                    && let Some((&frame, behind)) = after.split_first()
+                {
+                    fields.push(Field::number("freeze_frame", frame));
+                    after = behind;
+                }
+                if let Some(length) = length(pid).filter(|length| *length <= after.len()) {
+                    values(pid, &after[..length], fields);
+                    rest = &after[length..];
+                } else {
+                    fields.push(Field::bytes("value", after));
+                    rest = &[];
+                }
+            }
+        }
+        3 | 7 | 0x0A => {
+            if let Some((&count, codes)) = rest.split_first() {
+                fields.push(Field::number("trouble_codes", count));
+                fields.push(Field::text("codes", dtc::list(codes)));
+            }
+        }
+        9 => {
+            let Some((&pid, after)) = rest.split_first() else { return };
+            fields.push(Field::hex("pid", pid, 2).meaning(info_name(pid)));
+            if pid == 0 && after.len() >= 4 {
+                fields.push(Field::text("supported", supported(0, &after[after.len() - 4..])));
+                return;
+            }
+            let Some((&count, items)) = after.split_first() else { return };
+            let text = matches!(pid, 0x02 | 0x04 | 0x0A | 0x0D | 0x0F);
+            let name = match pid {
+                2 => "vin",
+                0x0A => "ecu_name",
+                _ => "value",
+            };
+            if text && count > 0 {
+                let shown: String = items
+                    .iter()
+                    .filter(|byte| byte.is_ascii_graphic() || **byte == b' ')
+                    .map(|byte| char::from(*byte))
+                    .collect();
+                fields.push(Field::text(name, shown.trim().to_owned()));
+            } else {
+                fields.push(Field::number("items", count));
+                fields.push(Field::bytes("value", items));
+            }
+        }
+        4 => {}
+        _ => fields.push(Field::bytes("value", rest)),
+    }
+}
+
+/// The service's name for people: `current data`.
+pub fn title(sid: u8) -> &'static str {
+    names::obd_service(sid).unwrap_or("unknown service")
+}
+
+/// Bytes as a text if they are one, else as they are.
+pub fn text_or_bytes(bytes: &[u8]) -> Value {
+    let end =
+        bytes.iter().rposition(|byte| *byte != 0 && *byte != b' ' && *byte != 0xFF).map_or(0, |at| at + 1);
+    let shown = &bytes[..end];
+    if shown.len() >= 3 && shown.iter().all(|byte| byte.is_ascii_graphic() || *byte == b' ') {
+        Value::Text(String::from_utf8_lossy(shown).into_owned().into())
+    } else {
+        Value::Bytes(bytes.to_vec())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn said(sid: u8, bytes: &[u8]) -> String {
+        let mut fields = Vec::new();
+        response(sid, bytes, &mut fields);
+        fields.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+    }
+
+    #[test]
+    fn parameters_have_their_values_and_units() {
+        for (bytes, expected) in [
+            (&[0x0C, 0x1A, 0xF8][..], "pid 0x0C (engine_speed), engine_speed 1726 rpm"),
+            (&[0x05, 0x7B], "pid 0x05 (coolant_temperature), coolant_temperature 83 °C"),
+            (&[0x0D, 0x32], "pid 0x0D (vehicle_speed), vehicle_speed 50 km/h"),
+            (&[0x11, 0xFF], "pid 0x11 (throttle_position), throttle_position 100 %"),
+            (&[0x06, 0x80], "pid 0x06 (short_term_fuel_trim_bank_1), short_term_fuel_trim_bank_1 0 %"),
+            (
+                &[0x32, 0xFF, 0xFC],
+                "pid 0x32 (evaporative_system_pressure), evaporative_system_pressure -1 Pa",
+            ),
+            (&[0x00, 0x80, 0, 0, 1], "pid 0x00 (supported), supported \"01 20\""),
+            (
+                &[0x01, 0x82, 1, 2, 3],
+                "pid 0x01 (monitor_status), mil \"on\", trouble_codes 2, monitors 01 02 03",
+            ),
+            (&[0xF0, 1], "pid 0xF0, value 01"),
+            (&[0x0C, 1], "pid 0x0C (engine_speed), value 01"),
+        ] {
+            assert_eq!(said(1, bytes), expected);
+        }
+        assert_eq!(
+            said(1, &[0x0D, 0x10, 0x05, 0x28]),
+            "pid 0x0D (vehicle_speed), vehicle_speed 16 km/h, pid 0x05 (coolant_temperature), coolant_temperature 0 °C"
+        );
+        assert_eq!(said(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
+        assert_eq!(said(9, b"\x02\x01WVWZZZ1KZAW000001"), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
+    }
+
+    #[test]
+    fn each_parameter_is_there_once() {
+        let mut pids: Vec<_> = LINES.iter().map(|line| line.pid).collect();
+        pids.sort_unstable();
+        pids.dedup();
+        assert_eq!(pids.len(), LINES.len());
+    }
+}

@@ -1,0 +1,120 @@
+use cantap_trace::{TraceEvent, TraceRecord};
+
+use super::*;
+use crate::testing::{self, at, hex};
+
+fn diagnostics() -> Diagnostics {
+    Diagnostics::new(&[], true)
+}
+
+fn said(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::said(diagnostics(), frames)
+}
+
+fn events(records: &[TraceRecord]) -> Vec<Event> {
+    testing::events(diagnostics(), records)
+}
+
+#[test]
+fn a_request_and_its_response_are_one_event() {
+    for (frames, expected) in [
+        (
+            &[
+                (0.0, "7E0#0322F190"),
+                (2.5, "7E8#101462F190575657"),
+                (3.0, "7E0#300000"),
+                (4.0, "7E8#215A5A5A314B5A41"),
+                (5.0, "7E8#2257303030303031"),
+            ][..],
+            "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, did 0xF190 (VIN), value \"WVWZZZ1KZAW000001\", after 2.5 ms",
+        ),
+        (
+            &[(0.0, "7E0#021003"), (1.0, "7E8#065003003201F4")],
+            "uds 7E0 > 7E8 DiagnosticSessionControl: sid 0x10, sub_function 0x03 (extended), p2_ms 50, p2_star_ms 5000, after 1 ms",
+        ),
+        (
+            &[(0.0, "18DA10F1#0427110000"), (1.0, "18DAF110#037F2733")],
+            "uds 18DA10F1 > 18DAF110 SecurityAccess: sid 0x27, sub_function 0x11 (request seed), parameters 00 00, \
+             nrc 0x33 (securityAccessDenied), after 1 ms",
+        ),
+        (
+            &[(0.0, "7E0#0431010203"), (1.0, "7E8#037F3178"), (3000.0, "7E8#057101020300")],
+            "uds 7E0 > 7E8 RoutineControl: sid 0x31, sub_function 0x01 (start), routine 0x0203, status 00, pending 1 times, \
+             after 3000 ms",
+        ),
+        (
+            &[(0.0, "7E0#03190209"), (1.0, "7E8#0759020901231108")],
+            "uds 7E0 > 7E8 ReadDTCInformation: sid 0x19, sub_function 0x02 (DTCs by status mask), status_mask 0x09, \
+             available_mask 0x09, trouble_codes 1, codes \"P0123-11 (confirmed)\", after 1 ms",
+        ),
+        (
+            &[(0.0, "7DF#02010C"), (1.0, "7E8#04410C1AF8")],
+            "obd 7DF > 7E8 current data: sid 0x01, pid 0x0C (engine_speed), engine_speed 1726 rpm, asked \"all\", after 1 ms",
+        ),
+        (
+            &[(0.0, "7E0#021A90"), (1.0, "7E8#065A9041424344")],
+            "kwp2000 7E0 > 7E8 readECUIdentification: sid 0x1A, local_identifier 0x90, value \"ABCD\", after 1 ms",
+        ),
+        (
+            &[(0.0, "7E0#023E80")],
+            "uds 7E0 > 7E8 TesterPresent: sid 0x3E, sub_function 0x00 (zero), response \"not wanted\"",
+        ),
+        (
+            &[(0.0, "7E8#037E0000")],
+            "uds 7E8 > 7E0 TesterPresent: sid 0x3E, sub_function 0x00 (zero), value 00, request \"not heard\"",
+        ),
+        (
+            &[(0.0, "7E0#0622F18CF187FF"), (1.0, "7E8#037F2213")],
+            "uds 7E0 > 7E8 ReadDataByIdentifier: sid 0x22, did 0xF18C (ECU serial number), did 0xF187 (spare part number), \
+             rest FF, nrc 0x13 (incorrectMessageLengthOrInvalidFormat), after 1 ms",
+        ),
+    ] {
+        assert_eq!(said(frames), [expected], "{frames:?}");
+    }
+}
+
+#[test]
+fn several_servers_answer_a_request_to_all() {
+    let frames = [(0.0, "7DF#020105"), (1.0, "7E8#03410528"), (2.0, "7E9#0341057B"), (9000.0, "123#")];
+    let said = said(&frames);
+    assert_eq!(said.len(), 2, "{said:?}");
+    assert!(said[1].starts_with("obd 7DF > 7E9 current data"), "{said:?}");
+    assert!(said[1].ends_with("asked \"all\", after 2 ms"), "{said:?}");
+}
+
+#[test]
+fn silence_is_said_and_a_loss_meanwhile_too() {
+    let all = events(&[at(0.0, "7E0#023E00"), at(2500.0, "123#")]);
+    assert_eq!((all[0].kind, all[0].time_ns), ("no_response", 2_000_000_000));
+    assert_eq!(all[0].trouble, Some(Trouble::Timeout { after_ms: 2000 }));
+    let gap = TraceRecord { time_ns: 1_000_000, channel: 1, event: TraceEvent::GAP };
+    let all = events(&[at(0.0, "7E0#023E00"), gap, at(2500.0, "123#")]);
+    assert!(all[0].frames_lost, "{all:?}");
+    let all = events(&[at(0.0, "7E0#023E00"), at(10.0, "7E0#021001"), at(11.0, "7E8#025001")]);
+    let kinds: Vec<_> = all.iter().map(|event| (event.kind, event.trouble)).collect();
+    assert_eq!(kinds, [("no_response", Some(Trouble::Overlapped)), ("exchange", None)]);
+    assert_eq!(events(&[at(0.0, "7E0#023E00")])[0].trouble, Some(Trouble::Unfinished));
+}
+
+/// Whatever comes, nothing panics and nothing grows.
+#[test]
+fn any_bytes_are_taken() {
+    let mut random = fastrand::Rng::with_seed(14_229);
+    let mut diagnostics = diagnostics();
+    let mut events = Vec::new();
+    for number in 0..300_000_u32 {
+        let id = random.choice([0x7DF, 0x7E0, 0x7E8, 0x7E1, 0x7E9, 0x123]).unwrap();
+        let length = random.usize(0..=8);
+        let mut bytes: Vec<u8> = (0..length).map(|_| random.u8(..)).collect();
+        if let Some(first) = bytes.first_mut()
+            && random.u8(0..4) > 0
+        {
+            *first = random.choice([1, 2, 3, 4, 5, 6, 7, 0x10, 0x21, 0x22, 0x30]).unwrap();
+        }
+        diagnostics.take(&at(f64::from(number) / 5.0, &format!("{id:03X}#{}", hex(&bytes))), &mut events);
+        assert!(diagnostics.waiting.len() <= MOST_WAITING);
+        for event in events.drain(..) {
+            let _ = event.to_string();
+        }
+    }
+}

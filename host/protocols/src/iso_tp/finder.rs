@@ -1,0 +1,107 @@
+//! Finds pairs by what they do: a first frame, a flow control frame of somebody else, and the first consecutive frame.
+
+use cantap_trace::Id;
+
+use super::pairs::{Endpoint, Pair};
+use super::pci::{self, FlowStatus, Pci};
+use super::{FLOW_TIMEOUT_NS, Transfer};
+
+/// First frames that wait for their flow control, on all channels.
+const MOST_CANDIDATES: usize = 64;
+
+/// A frame that may be a first one.
+#[derive(Clone, Debug)]
+struct Candidate {
+    channel: u8,
+    from: Endpoint,
+    time_ns: i64,
+    length: u32,
+    data: Vec<u8>,
+    flow: Option<(Endpoint, u8, u32)>,
+}
+
+/// Looks for pairs among identifiers that belong to none.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Finder {
+    candidates: Vec<Candidate>,
+}
+
+impl Finder {
+    /// Takes a frame; returns the pair and the transfer that has begun when this frame is its first consecutive one, which is still
+    /// to be taken as such.
+    pub fn take(&mut self, channel: u8, id: Id, bytes: &[u8], time_ns: i64) -> Option<(Pair, Transfer)> {
+        // The address may be in front of it or not.
+        for offset in [0, 1] {
+            let Some(&first) = bytes.get(offset) else { continue };
+            match first >> 4 {
+                1 | 3 => {}
+                2 if !self.candidates.is_empty() => {}
+                _ => continue,
+            }
+            let Ok(Some(pci)) = pci::parse(bytes, offset) else { continue };
+            let from = Endpoint { id, address: (offset == 1).then(|| bytes[0]) };
+            match pci {
+                Pci::First { length, data } if length <= 4095 => {
+                    self.candidates.retain(|old| {
+                        (old.channel, old.from) != (channel, from) && time_ns - old.time_ns <= FLOW_TIMEOUT_NS
+                    });
+                    if self.candidates.len() == MOST_CANDIDATES {
+                        self.candidates.remove(0);
+                    }
+                    let data = data.to_vec();
+                    self.candidates.push(Candidate { channel, from, time_ns, length, data, flow: None });
+                }
+                Pci::Flow { status: FlowStatus::Go, block_size, separation_us }
+                    if is_padded(&bytes[offset + 3..]) =>
+                {
+                    // The last one before the first consecutive frame counts: that frame follows at once.
+                    for candidate in &mut self.candidates {
+                        if candidate.channel == channel
+                            && candidate.from.id != id
+                            && candidate.from.id.is_extended() == id.is_extended()
+                            && candidate.from.address.is_some() == from.address.is_some()
+                            && time_ns - candidate.time_ns <= FLOW_TIMEOUT_NS
+                        {
+                            candidate.flow = Some((from, block_size, separation_us));
+                        }
+                    }
+                }
+                Pci::Consecutive { number: 1, .. } => {
+                    let place = self.candidates.iter().position(|candidate| {
+                        (candidate.channel, candidate.from) == (channel, from) && candidate.flow.is_some()
+                    });
+                    if let Some(place) = place {
+                        let found = self.candidates.remove(place);
+                        let (to, block_size, separation_us) = found.flow?;
+                        let transfer = Transfer {
+                            time_ns: found.time_ns,
+                            start_ns: found.time_ns,
+                            channel,
+                            from,
+                            to: Some(to),
+                            data: found.data,
+                            length: found.length,
+                            frames: 2,
+                            block_size: Some(block_size),
+                            separation_us: Some(separation_us),
+                            ..Transfer::empty()
+                        };
+                        return Some((Pair { a: from, b: to }, transfer));
+                    }
+                }
+                _ => {}
+            }
+        }
+        None
+    }
+
+    /// Frames of the channel are missing: what comes next may belong to others.
+    pub fn interrupt(&mut self, channel: u8) {
+        self.candidates.retain(|candidate| candidate.channel != channel);
+    }
+}
+
+/// What fills a frame up is the same byte throughout.
+fn is_padded(rest: &[u8]) -> bool {
+    rest.windows(2).all(|two| two[0] == two[1])
+}

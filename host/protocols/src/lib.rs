@@ -1,0 +1,22 @@
+#![doc = include_str!("../README.md")]
+//!
+//! An [`Assembler`] takes records and gives [`Event`]s. [`Conversations`] runs those of several protocols; a [`Survey`] says which of
+//! them a bus speaks.
+
+#![forbid(unsafe_code)]
+
+mod assembler;
+mod conversations;
+pub mod diagnostics;
+mod event;
+pub mod iso_tp;
+mod protocol;
+mod survey;
+#[cfg(test)]
+mod testing;
+
+pub use assembler::{Assembler, is_gap};
+pub use conversations::{Conversations, Options};
+pub use event::{Event, Field, Party, Trouble, Value};
+pub use protocol::{Protocol, UnknownProtocol};
+pub use survey::{Evidence, Survey};

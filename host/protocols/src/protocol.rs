@@ -1,0 +1,62 @@
+//! The protocols, by name.
+
+use std::fmt;
+use std::str::FromStr;
+
+/// A protocol that events are of.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum Protocol {
+    /// Transfers of ISO 15765-2 whose content is no known service.
+    IsoTp,
+    /// Diagnostic services of ISO 14229.
+    Uds,
+    /// Diagnostic services of ISO 14230-3 on CAN.
+    Kwp2000,
+    /// Services 01 to 0A of SAE J1979.
+    Obd,
+}
+
+impl Protocol {
+    /// All of them.
+    pub const ALL: [Self; 4] = [Self::IsoTp, Self::Uds, Self::Kwp2000, Self::Obd];
+
+    /// As it is called in text, JSON and on the command line.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::IsoTp => "isotp",
+            Self::Uds => "uds",
+            Self::Kwp2000 => "kwp2000",
+            Self::Obd => "obd",
+        }
+    }
+
+    /// Its bit in a set.
+    pub(crate) const fn bit(self) -> u16 {
+        1 << self as u16
+    }
+}
+
+impl fmt::Display for Protocol {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.pad(self.name())
+    }
+}
+
+/// No protocol has this name.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("there is no protocol '{name}'; there are {}", Protocol::ALL.map(Protocol::name).join(", "))]
+pub struct UnknownProtocol {
+    /// What was given.
+    pub name: String,
+}
+
+impl FromStr for Protocol {
+    type Err = UnknownProtocol;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let name = text.to_ascii_lowercase();
+        let found = Self::ALL.into_iter().find(|protocol| protocol.name() == name);
+        found.ok_or_else(|| UnknownProtocol { name: text.to_owned() })
+    }
+}

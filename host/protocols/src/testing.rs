@@ -1,0 +1,44 @@
+//! Records for the tests.
+
+use std::fmt::Write as _;
+
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_wire::record::LossStage;
+
+use crate::{Assembler, Event};
+
+/// A frame on channel 1.
+pub fn at(time_ms: f64, frame: &str) -> TraceRecord {
+    let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
+    TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
+}
+
+/// A frame of channel 1 was lost.
+pub fn lost(time_ms: f64) -> TraceRecord {
+    let event = TraceEvent::Lost { stage: Some(LossStage::Queue), count: 1, at_least: false };
+    TraceRecord { time_ns: (time_ms * 1e6) as i64, channel: 1, event }
+}
+
+/// As in a frame's text.
+pub fn hex(bytes: &[u8]) -> String {
+    bytes.iter().fold(String::new(), |mut text, byte| {
+        write!(text, "{byte:02X}").unwrap();
+        text
+    })
+}
+
+/// What an assembler makes of the records.
+pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Event> {
+    let mut events = Vec::new();
+    for record in records {
+        assembler.take(record, &mut events);
+    }
+    assembler.finish(&mut events);
+    events
+}
+
+/// The same, of frames at times in milliseconds, in words.
+pub fn said(assembler: impl Assembler, frames: &[(f64, &str)]) -> Vec<String> {
+    let records: Vec<_> = frames.iter().map(|(ms, frame)| at(*ms, frame)).collect();
+    events(assembler, &records).iter().map(ToString::to_string).collect()
+}

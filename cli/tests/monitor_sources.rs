@@ -237,6 +237,14 @@ fn a_channel_that_is_bus_off_is_brought_back_from_inside() {
     view.wait_until("it is back", |screen| !screen.contains("BUS-OFF"));
     view.keys("q");
     assert_eq!(view.end(), 0);
+    // By itself after a time, as by every other command.
+    let line = "monitor virtual:load=0,disturb=32 -b 500k --normal --recovery 100ms --view send";
+    let mut view = Terminal::start(line, (140, 24));
+    view.wait_for("NORMAL: running");
+    view.keys("a123#11\r\r");
+    view.wait_for("channel 1 was bus-off and joins the bus again");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
 }
 
 #[test]

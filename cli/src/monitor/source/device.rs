@@ -75,6 +75,7 @@ impl Source<'_> {
         // Devices of which nothing is known yet, and what was ordered meanwhile.
         let mut unknown = vec![true; plan.addresses.len()];
         let mut early = VecDeque::new();
+        let mut recoveries: Vec<_> = plan.addresses.iter().map(|_| plan.open.recovery()).collect();
         lock(self.model).source = SourceState::Starting;
         loop {
             match lines.next(WAIT) {
@@ -98,6 +99,14 @@ impl Source<'_> {
                 }
                 // Nobody has stopped it.
                 (_, Happening::Ended) => return Then::GoOn,
+            }
+            for (board, device) in lines.devices() {
+                // If it does not answer, the stream says so.
+                let back = recoveries[board].as_mut().and_then(|recovery| recovery.look(device).ok());
+                for channel in back.into_iter().flatten() {
+                    let number = channel_number(board, channel);
+                    self.notice(format!("channel {number} was bus-off and joins the bus again"));
+                }
             }
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;

@@ -192,7 +192,7 @@ fn the_window_pans_back_and_follows_again() {
     screen_text(&mut app, &model, (100, 24)).unwrap();
     keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::PageUp]);
     assert_eq!(app.graph.end_ns, Some(NOON + 59_900 * MS - 6 * S));
-    assert!(screen_text(&mut app, &model, (100, 24)).unwrap().contains("NOT FOLLOWING, End follows"));
+    assert!(screen_text(&mut app, &model, (100, 24)).unwrap().contains("  NOT FOLLOWING"));
     keys(&mut app, &mut model, &[KeyCode::Home]);
     assert_eq!(app.graph.end_ns, Some(NOON + 10 * S));
     keys(&mut app, &mut model, &[KeyCode::PageDown; 12]);

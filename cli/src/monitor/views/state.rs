@@ -119,7 +119,9 @@ fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Sp
     }
     if app.frozen.is_some() {
         spans.push(Span::styled("  PAUSED", Theme::heading()));
-    } else if app.view == View::Trace && app.cursor.is_some() {
+    } else if (app.view == View::Trace && app.cursor.is_some())
+        || (app.view == View::Graph && app.graph.end_ns.is_some())
+    {
         spans.push(Span::styled("  NOT FOLLOWING", Theme::heading()));
     }
     if !model.history.filters().is_empty() {

@@ -108,11 +108,17 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, seen: &Seen) {
         page.lane(frame, *area, *chosen);
     }
     if let [.., times, said] = areas[..] {
-        page.times(frame, times);
         let is_cut =
             panes.iter().flat_map(|(_, rows)| rows).chain(&lanes).any(|chosen| chosen.series.is_cut());
-        frame.render_widget(Paragraph::new(page.said(oldest, is_cut)), said);
+        let not_kept = (is_cut && from_ns < oldest).then_some(oldest);
+        let is_said = page.times(frame, times, not_kept);
+        frame.render_widget(Paragraph::new(page.said(not_kept.filter(|_| !is_said))), said);
     }
+}
+
+/// Said where the window begins before the oldest value.
+fn not_kept_before(oldest_ns: i64) -> String {
+    format!("before {} nothing is kept (--history)", clock(oldest_ns, 0))
 }
 
 impl Page<'_> {
@@ -256,11 +262,22 @@ impl Page<'_> {
         frame.render_widget(Paragraph::new(text), area);
     }
 
-    /// Times of day below the curves, and the cursors' names where they stand.
-    fn times(&self, frame: &mut Frame<'_>, area: Rect) {
+    /// Times of day below the curves, and the cursors' names where they stand. Where nothing is kept any more, that is said in place of
+    /// times, if there is room; returns whether it was.
+    fn times(&self, frame: &mut Frame<'_>, area: Rect, not_kept: Option<i64>) -> bool {
         let time = self.time(usize::from(self.columns.width));
         let tick = if self.app.theme.unicode { '╵' } else { '|' };
         let mut line: Vec<char> = axis::times(time, tick).chars().collect();
+        let nothing = not_kept.map(|oldest_ns| (time.place(oldest_ns), not_kept_before(oldest_ns)));
+        let nothing = nothing.and_then(|(place, text)| Some((place?, text)));
+        let is_said = nothing.is_some_and(|(place, text)| {
+            let fits = text.chars().count() < place;
+            if fits {
+                line[..place].fill(' ');
+                line.iter_mut().zip(text.chars()).for_each(|(cell, character)| *cell = character);
+            }
+            fits
+        });
         for (name, at) in self.cursors() {
             if let Some(cell) = time.place(at).and_then(|place| line.get_mut(place)) {
                 *cell = name;
@@ -271,10 +288,11 @@ impl Page<'_> {
         let line: String = line.into_iter().collect();
         let line = Line::styled(format!("{utc:<indent$}{line}"), self.app.theme.label());
         frame.render_widget(Paragraph::new(line), area);
+        is_said
     }
 
     /// The window's length, where the cursors are, and what is not in sight.
-    fn said(&self, oldest_ns: i64, is_cut: bool) -> Line<'static> {
+    fn said(&self, not_kept: Option<i64>) -> Line<'static> {
         let theme = self.app.theme;
         let graph = &self.app.graph;
         let mut text = format!(" {} s", short(graph.span_ns as f64 / 1e9));
@@ -288,12 +306,8 @@ impl Page<'_> {
             let _ = write!(text, "  Δt {between:.6} s");
         }
         let mut spans = vec![Span::styled(text, theme.label())];
-        if graph.end_ns.is_some() {
-            spans.push(Span::styled("  NOT FOLLOWING, End follows", Theme::heading()));
-        }
-        if is_cut && self.from_ns < oldest_ns {
-            let text = format!("  before {} nothing is kept (--history)", clock(oldest_ns, 0));
-            spans.push(Span::styled(text, theme.loss()));
+        if let Some(oldest_ns) = not_kept {
+            spans.push(Span::styled(format!("  {}", not_kept_before(oldest_ns)), theme.loss()));
         }
         Line::from(spans)
     }

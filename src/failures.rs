@@ -1,7 +1,7 @@
 //! Why the firmware failed, in memory that a reset leaves as it is.
 //!
-//! The log is written by a panic, a fault or the next start, and read by whoever asks, until the chip loses its power. Then
-//! its memory holds anything; the checksum tells.
+//! The log is written by a panic, a fault or the next start, and can be read until the chip loses its power. After that
+//! its memory may hold anything, which the checksum shows.
 
 use core::fmt::{self, Write};
 

@@ -5,7 +5,7 @@
 const FLICKER_MS: u16 = 50;
 /// Half a period of the pattern for errors, in ms.
 const ERROR_MS: u16 = 125;
-/// An error is shown at least for so long, in ms.
+/// An error is shown at least for this long, in ms.
 const ERROR_FOR_MS: u16 = 1_000;
 /// Half a period of the pattern that shows where the device is, in ms.
 const IDENTIFY_MS: u16 = 60;
@@ -68,7 +68,7 @@ impl Lights {
         Self { now_ms: 0, traffic_left_ms: 0, error_left_ms: 0, identify_left_ms: 0 }
     }
 
-    /// Shows the pattern for so long; 0 ends it.
+    /// Shows the pattern for this long; 0 ends it.
     pub const fn identify(&mut self, seconds: u8) {
         self.identify_left_ms = seconds as u32 * 1000;
     }
@@ -102,7 +102,7 @@ mod tests {
     const FRAME: Activity = Activity { traffic: true, error: false };
     const ERROR: Activity = Activity { traffic: false, error: true };
 
-    /// How often `is` turns true in so many milliseconds.
+    /// How often `is` turns true in this many milliseconds.
     fn turns(lights: &mut Lights, ms: u32, activity: Activity, is: fn(Lit) -> bool) -> usize {
         let seen: Vec<bool> = (0..ms).map(|_| is(lights.tick(activity))).collect();
         seen.windows(2).filter(|pair| !pair[0] && pair[1]).count()

@@ -4,7 +4,7 @@
 //! |---|---|---|
 //! | 5 | both channels' receive and transmit interrupts: the stamp, and nothing else | a late stamp is a wrong one |
 //! | 4 | draining both FIFOs, confirming, error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
-//! | 2 | USB, the millisecond tick | a host can be told to wait |
+//! | 2 | USB, the millisecond tick | a host can be made to wait |
 //! | – | idle | sleeps |
 //!
 //! Everything at one priority runs to its end before the next begins, so what only it touches needs no lock. Of those that wait, the
@@ -248,7 +248,7 @@ mod app {
         session.poll(usb, &mut Access { tap, controls });
     }
 
-    /// Once a millisecond: flushes batches, keeps time, looks after what no interrupt tells, feeds the watchdog.
+    /// Once a millisecond: flushes batches, keeps time, looks after what no interrupt reports, feeds the watchdog.
     ///
     /// Priority 2, with USB, because it talks to the host too. A tick that is late by milliseconds delays a batch; one that
     /// is late by four seconds restarts the chip.

@@ -59,7 +59,7 @@ pub trait Traffic {
     /// Whether the FIFO dropped frames since the last call. The FIFO is locked when full: it keeps the
     /// oldest and drops the newest.
     fn take_overrun(&mut self) -> bool;
-    /// [`Self::pending`] and [`Self::take_overrun`] at one look.
+    /// [`Self::pending`] and [`Self::take_overrun`] in one read.
     fn look(&mut self) -> (u8, bool) {
         (self.pending(), self.take_overrun())
     }
@@ -110,9 +110,9 @@ pub trait Chip {
     fn temperature_decicelsius(&mut self) -> Option<i16>;
     /// Supply voltage in mV, if it can be measured.
     fn supply_millivolts(&mut self) -> Option<u16>;
-    /// How often the firmware failed since the chip got its power, and why last.
+    /// How often the firmware has failed since power-on, and why it last did.
     fn failures(&mut self) -> Failures;
-    /// Shows a pattern on the LEDs for so long.
+    /// Shows a pattern on the LEDs for this long.
     fn identify(&mut self, seconds: u8);
     /// Restarts the firmware; on the board it does not return.
     fn reset(&mut self);
@@ -141,7 +141,7 @@ pub trait Port {
     fn hold(&mut self, hold: bool);
 }
 
-/// Packets that may still come from a host that was told to wait: those that were let in before.
+/// Packets that may still come from a host that is made to wait: those that were let in before.
 pub const ON_ITS_WAY: usize = 4;
 /// Largest packet of a full-speed bulk endpoint, in bytes (USB 2.0, 5.8.3).
 pub const PACKET: usize = 64;

@@ -40,7 +40,7 @@ enum Action {
     Pass {
         ms: u8,
     },
-    /// The host reads so many packets more, or all.
+    /// The host reads this many packets more, or all.
     Read {
         packets: Option<u8>,
     },

@@ -104,7 +104,7 @@ fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
     }
     bench.millisecond();
     bench.millisecond();
-    // Each loss record stands exactly in the gap: counting it as so many frames gives every later frame its number.
+    // Each loss record stands exactly in the gap: counting it as this many frames gives every later frame its number.
     let mut next = 0;
     let mut lost = 0;
     for (_, record) in &bench.records {
@@ -129,7 +129,7 @@ fn a_full_queue_drops_and_counts_but_still_empties_the_fifo() {
     assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
 }
 
-/// A loss that no later frame brings to light is still told.
+/// A loss that no later frame brings to light is still reported.
 #[test]
 fn a_loss_at_the_very_end_is_reported_without_another_frame() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

@@ -53,7 +53,7 @@ impl<'q> Watched<'q> {
         self.bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
     }
 
-    /// A frame is received, and its time is told as it was.
+    /// A frame is received, and its time arrives as it was.
     fn receive_in_time(&mut self) {
         self.bench.pass(1000);
         let at = self.now();
@@ -207,7 +207,7 @@ proptest! {
         for _ in 0..4 {
             read(&mut heard);
         }
-        // What was lost is told in between, at the time of what follows.
+        // What was lost is reported in between, at the time of what follows.
         heard.retain(|(_, record)| !matches!(record, Record::Event(Event::Lost { .. })));
         if lost == [0; 2] {
             prop_assert_eq!(heard, written);

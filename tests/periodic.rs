@@ -85,7 +85,7 @@ fn full_tables_that_cannot_leave_cost_no_alarms_and_few_records() {
     let counted = counters(&mut bench).1 - before;
     let all = passed * PERIODIC_SLOTS as u32;
     assert!(counted.abs_diff(all) <= 2 * PERIODIC_SLOTS as u32, "{counted} of {all}");
-    // And told: but for what has passed since the last word on each.
+    // And reported: but for what has passed since each one's last record.
     let told: u32 = told(&bench).0.iter().sum();
     assert!(told <= counted && told >= counted / 2, "{told} of {counted}");
 }
@@ -160,7 +160,7 @@ fn every_entry_of_a_table_that_asks_for_too_much_gets_its_turn() {
     assert!(sent.iter().all(|sent| (19..=21).contains(sent)), "{sent:?}");
 }
 
-/// An entry that is cleared, replaced or done takes nothing with it that was not told.
+/// An entry that is cleared, replaced or done takes nothing with it that was not reported.
 #[test]
 fn what_passed_is_told_also_after_the_entry_is_gone() {
     let queue = Queue::new();
@@ -172,7 +172,7 @@ fn what_passed_is_told_also_after_the_entry_is_gone() {
     for slot in 0..3 {
         set(&mut bench, CAN1, slot, Some(entry(slot, TICKS_PER_MS, 1)));
     }
-    // Each waits behind the queue's frames, and ten of its periods pass; but for what the records of before told.
+    // Each waits behind the queue's frames, and ten of its periods pass; but for what earlier records reported.
     live(&mut bench, 10_500);
     set(&mut bench, CAN1, 0, None);
     set(&mut bench, CAN1, 1, Some(entry(1, 1000 * TICKS_PER_MS, 0)));
@@ -199,7 +199,7 @@ fn closing_tells_what_passed_before_the_stop() {
     bench.millisecond();
     assert_eq!(bench.events().last(), Some(&Event::Stopped { channel: CAN1 }));
     let (_, failed) = counters(&mut bench);
-    // Three were in mailboxes, and are told one by one.
+    // Three were in mailboxes, and are reported one by one.
     assert_eq!(told(&bench).0.iter().sum::<u32>() + 3, failed);
     assert!(failed > 19 * PERIODIC_SLOTS as u32);
 }

@@ -408,7 +408,7 @@ fn a_host_that_wakes_gets_what_was_queued_and_is_told_that_the_session_has_ended
     assert_eq!(bench.frames(CAN1), [numbered(4)]);
 }
 
-/// The cable was pulled, or the host lost power while it slept: there is nobody to be told.
+/// The cable was pulled, or the host lost power while it slept: there is nobody to report to.
 #[test]
 fn what_was_kept_for_a_sleeping_host_goes_with_it() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

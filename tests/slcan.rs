@@ -234,7 +234,7 @@ fn losses_and_errors_set_flags_that_reading_clears() {
     converse(&mut bench, &[("F", "F24\r"), ("F", "F00\r")]);
 }
 
-/// With K1, what `F` would tell is told in lines that Linux' slcan driver takes, none of them shorter than five characters.
+/// With K1, what `F` would report comes in lines that Linux' slcan driver takes, none of them shorter than five characters.
 #[test]
 fn losses_errors_and_states_are_lines_where_they_are_asked_for() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();

@@ -9,7 +9,7 @@ use cantap_wire::message::Mode;
 use cantap_wire::{Channel, Event, Record};
 use fakes::{Bench, SMALL_QUEUE, numbered};
 
-/// The host's frames start so long before the device's milliseconds.
+/// The host's frames start this long before the device's milliseconds.
 const PHASE_TICKS: u32 = 300 * TICKS_PER_US;
 
 /// So many milliseconds, each with a SOF, and the frames numbered from `frame` on.

@@ -279,7 +279,7 @@ fn a_period_that_passes_unsent_is_told() {
     assert_eq!(failures(&mut bench), 3);
     let sent: Vec<Frame> = std::iter::from_fn(|| bench.send_one(CAN1)).collect();
     assert_eq!(sent.len(), 4);
-    // How many there were is told ten times a second.
+    // How many there were is reported ten times a second.
     for _ in 0..200 {
         bench.millisecond();
         bench.alarm();

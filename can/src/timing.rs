@@ -1,8 +1,10 @@
-//! Bit timing: what a controller is told, and every way to reach a bit rate.
+//! Bit timing: what a controller is set to, and every way to reach a bit rate.
 //!
 //! Ranges are bxCAN's (RM0090, "CAN bit timing register"): prescaler 1 to 1024, bit segment 1
 //! (propagation and phase segment 1) 1 to 16, bit segment 2 1 to 8, jump width 1 to 4 quanta. A bit
 //! is one synchronisation quantum and both segments long.
+
+use core::fmt;
 
 /// Slowest bit rate that is offered, in bit/s.
 pub const MIN_BITRATE_BPS: u32 = 5_000;
@@ -25,6 +27,7 @@ pub struct BitTiming {
 
 /// Why there is no timing for a bit rate.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum NoTiming {
     /// Outside [`MIN_BITRATE_BPS`] to [`MAX_BITRATE_BPS`].
     OutOfRange,
@@ -37,6 +40,27 @@ pub enum NoTiming {
         above_bps: Option<u32>,
     },
 }
+
+impl fmt::Display for NoTiming {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::OutOfRange => write!(f, "bit rates go from {MIN_BITRATE_BPS} to {MAX_BITRATE_BPS} bit/s"),
+            Self::Unreachable { below_bps: Some(below), above_bps: Some(above) } => {
+                write!(
+                    f,
+                    "the clock cannot be divided to it; the nearest rates are {below} and {above} bit/s"
+                )
+            }
+            Self::Unreachable { below_bps: Some(nearest), .. }
+            | Self::Unreachable { above_bps: Some(nearest), .. } => {
+                write!(f, "the clock cannot be divided to it; the nearest rate is {nearest} bit/s")
+            }
+            Self::Unreachable { .. } => f.write_str("the clock cannot be divided to any bit rate of CAN"),
+        }
+    }
+}
+
+impl core::error::Error for NoTiming {}
 
 impl BitTiming {
     /// Whether every field is in the controller's range.
@@ -162,6 +186,17 @@ mod tests {
     /// The CAN clock of cantap's boards. It divides to every bit rate that CiA lists; the 42 MHz of an
     /// STM32F405 at full speed do not reach 800 kbit/s.
     const CLOCK: u32 = 36_000_000;
+
+    #[test]
+    fn a_rate_that_is_not_reached_says_what_is() {
+        let words = |clock, rate| BitTiming::choose(clock, rate, None).unwrap_err().to_string();
+        assert_eq!(words(CLOCK, 4_999), "bit rates go from 5000 to 1000000 bit/s");
+        assert_eq!(
+            words(42_000_000, 800_000),
+            "the clock cannot be divided to it; the nearest rates are 777778 and 807692 bit/s"
+        );
+        assert_eq!(words(1, 500_000), "the clock cannot be divided to any bit rate of CAN");
+    }
 
     #[test]
     fn every_cia_rate_is_reached_near_its_sample_point() {

@@ -9,7 +9,7 @@ use cantap_signals::{Decoder, Source, dbc};
 
 const DATABASE: &str = include_str!("data/engine.dbc");
 
-/// Shows so many messages; returns the last one's signals as text.
+/// Shows this many messages; returns the last one's signals as text.
 pub fn show(device: &Device, messages: usize) -> Result<String, Box<dyn Error>> {
     let database = dbc::parse("engine.dbc", DATABASE.as_bytes())?;
     let decoder = Decoder::new(vec![Source { channel: None, database }]);

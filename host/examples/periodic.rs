@@ -10,7 +10,7 @@ use cantap::periodic::{check_modifiers, period_ticks};
 use cantap::wire::message::{Checksum, Modifier, Periodic};
 use cantap::{Channel, Device, Frame};
 
-/// Sends so many frames, 10 ms apart; returns them as they were on the bus.
+/// Sends this many frames, 10 ms apart; returns them as they were on the bus.
 pub fn repeat(device: &Device, count: u32) -> Result<Vec<Frame>, Box<dyn Error>> {
     let frame: Frame = "123#00A5000000000000".parse()?;
     let modifiers = [

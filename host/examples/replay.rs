@@ -10,7 +10,7 @@ use cantap::replay::{Accuracy, Pace, Replay};
 use cantap::{Channel, Device, TraceFrame};
 use cantap_formats::{ReadOptions, open_reader};
 
-/// The bus is given up when nothing leaves for so long.
+/// The bus is given up when nothing leaves for this long.
 const PATIENCE: Duration = Duration::from_secs(5);
 
 /// Replays a file on channel 1; returns how well its times were kept.

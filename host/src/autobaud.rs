@@ -27,11 +27,11 @@ const GOOD_FRAMES: u32 = 4;
 const SHARP_FRAMES: u32 = 10;
 /// Frames and errors that are weighed where there are both: a frame may have been destroyed at the right rate, too.
 const WEIGHED_FRAMES: u32 = 24;
-/// The right rate is wrong about fewer than one frame in so many.
+/// The right rate is wrong about fewer than one frame in this many.
 const FRAMES_PER_ERROR: u32 = 8;
 /// Frames and errors that are looked at where both tell something.
 const STUDY_FRAMES: u32 = 8;
-/// A rate at which a frame was heard is listened to for so long at least.
+/// A rate at which a frame was heard is listened to for this long at least.
 const PATIENCE: Duration = Duration::from_secs(2);
 /// How often the device is asked.
 const ASK_EVERY: Duration = Duration::from_millis(2);
@@ -401,7 +401,7 @@ impl Search<'_> {
         const REACH: [f64; 2] = [0.012, 0.05];
         /// A smaller share of failing frames would take too many to be noticed.
         const LEAST_SHARE: f64 = 0.15;
-        /// How likely it may be that none of so many frames is one that tells.
+        /// How likely it may be that none of this many frames is one that tells.
         const CHANCE: f64 = 0.02;
         /// Rates that are thought of.
         const MOST_RATES: usize = 6;

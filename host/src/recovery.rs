@@ -13,8 +13,8 @@ use crate::{Device, DeviceError};
 /// How often the device is asked.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
-/// A channel that was told to come back is there after 128 times 11 recessive bits, 0.3 s at 5 kbit/s on a quiet bus. One that is
-/// bus-off still, or again, after so long is told once more.
+/// A channel that was asked to come back is there after 128 times 11 recessive bits, 0.3 s at 5 kbit/s on a quiet bus. One that is
+/// bus-off still, or again, after this long is asked once more.
 const COMES_WITHIN: Duration = Duration::from_secs(1);
 
 /// A channel that is bus-off.
@@ -35,7 +35,7 @@ pub struct Recovery {
 }
 
 impl Recovery {
-    /// Channels come back so long after they went bus-off.
+    /// Channels come back this long after they went bus-off.
     pub fn new(after: Duration) -> Self {
         Self { after, off: [None; CHANNELS], look_at: Instant::now() }
     }

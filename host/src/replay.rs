@@ -1,6 +1,6 @@
 //! Plays a trace on a bus at its own times, kept by the device's clock.
 //!
-//! A trace's time is a frame's end; the device is told when to begin. So each frame's exact length is taken off, and the
+//! A trace's time is a frame's end; the device needs to know when to begin. So each frame's exact length is taken off, and the
 //! frames end as far apart as in the trace, whatever their lengths. The host streams ahead of time as much as
 //! the device's queue holds; its own delays do not show on the bus.
 
@@ -18,7 +18,7 @@ use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 const LEAD: Duration = Duration::from_millis(100);
 /// Frames due later than this wait in the host: a device takes none that is more than a day ahead.
 const MOST_AHEAD: Duration = Duration::from_hours(1);
-/// How often is looked whether to go on.
+/// How often to check whether to go on.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// How to change the trace's times.
@@ -28,7 +28,7 @@ pub struct Pace {
     pub speed: f64,
     /// Longer pauses are skipped: the next frame follows at once.
     pub longest_gap: Option<Duration>,
-    /// Bursts begin at least so long after each other, on all channels together.
+    /// Bursts begin at least this long after each other, on all channels together.
     pub shortest_gap: Duration,
     /// Frames of a burst, from 1: those after its first wait for nothing but the trace's own times.
     pub burst: u32,
@@ -99,7 +99,7 @@ impl Timetable {
         self.last = Some((begin_ns, at_ns));
         // Whole ticks first: a float does not hold a long uptime's nanoseconds.
         let ticks = |ns: f64| (ns / self.tick_ns).round() as i64;
-        // A trace out of order may plan an end before the device's start: what is told of lateness counts from there, too.
+        // A trace out of order may plan an end before the device's start: lateness counts from there, too.
         let end = self.first_ticks.wrapping_add_signed(ticks(at_ns + length_ns));
         (self.first_ticks.saturating_add_signed(ticks(at_ns)), end)
     }
@@ -199,7 +199,7 @@ impl<'d> Replay<'d> {
         self.stream.flush()
     }
 
-    /// Waits for the next end of a transmission, at most so long.
+    /// Waits for the next end of a transmission, at most this long.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
         self.stream.wait(at_most)
     }

@@ -141,7 +141,7 @@ impl<'d> Stream<'d> {
         Ok(true)
     }
 
-    /// Waits for the next end of a transmission, at most so long.
+    /// Waits for the next end of a transmission, at most this long.
     pub fn wait(&mut self, at_most: Duration) -> Result<(), DeviceError> {
         self.collect(at_most)
     }
@@ -190,7 +190,7 @@ impl<'d> Stream<'d> {
                     wait = Duration::ZERO;
                 }
                 Err(RecvTimeoutError::Timeout) => return Ok(()),
-                // The reader has ended: a request tells why.
+                // The reader has ended: a request says why.
                 Err(RecvTimeoutError::Disconnected) => return self.device.time().map(|_| ()),
             }
         }

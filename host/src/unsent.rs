@@ -1,6 +1,6 @@
 //! Why frames were not sent: the one place that decides it, from what the device's stream and its status tell.
 //!
-//! A device tells how each transmission ended, but not why one does not end at all: a controller tries for ever. Then the
+//! A device reports how each transmission ended, but not why one does not end at all: a controller tries for ever. Then the
 //! errors since its last frame, its state and what others send tell what is in the way. The records of the device are taken
 //! for it, so it is for programs that do not use them otherwise.
 
@@ -13,13 +13,13 @@ use cantap_wire::{CHANNELS, Channel};
 use crate::device::{Records, Transmission};
 use crate::{Device, DeviceError, Direction, TraceEvent, TraceRecord};
 
-/// Frames that are due and of which none ended for so long stand still.
+/// Frames that are due and of which none ended for this long stand still.
 pub const PATIENCE: Duration = Duration::from_secs(1);
 /// How often the device is asked how it is.
 const LOOK_EVERY: Duration = Duration::from_millis(250);
 /// From this load on, in per cent, a bus is full for whoever has a high identifier.
 const FULL_PCT: f64 = 80.0;
-/// A load is told only over a time that is long against a frame.
+/// A load means something only over a time that is long against a frame.
 const LEAST_SPAN_NS: i64 = 100_000_000;
 
 /// Why frames were not sent.
@@ -115,7 +115,7 @@ struct Seen {
     errors_since: Errors,
     others_since: Others,
     went_off_since: bool,
-    /// How often each reason was told, [`TransmitFailure::Overtaken`] apart.
+    /// How often each reason was given, [`TransmitFailure::Overtaken`] apart.
     failures: Vec<(TransmitFailure, u64)>,
     overtaken: u64,
     /// Device time, in ticks, and the host's, from which a standstill counts.

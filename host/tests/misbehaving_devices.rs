@@ -15,7 +15,7 @@ use cantap::wire::record::LossStage;
 use cantap::{Channel, Device, DeviceError, TraceEvent, TraceRecord};
 use fake_device::{FakeDevice, Fault, Log};
 
-/// Nothing here takes so long, however busy the machine is.
+/// Nothing here takes this long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
 /// Frames on a channel before a device misbehaves.
 const BEFORE: u32 = 60;
@@ -51,7 +51,7 @@ fn line(faults: &[(Fault, &'static str)], mode: Mode, log: &Arc<Mutex<Log>>) -> 
     })
 }
 
-/// Everything that happened until there were so many records behind the last return, and what came of the end.
+/// Everything that happened until there were this many records behind the last return, and what came of the end.
 #[derive(Default)]
 struct Seen {
     records: Vec<TraceRecord>,

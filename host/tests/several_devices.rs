@@ -10,7 +10,7 @@ use cantap::device::{FollowerReport, FrameDoubt, Happening, NotCommon, Reconnect
 use cantap::{Channel, Device, DeviceError, TraceEvent, TraceRecord};
 use fake_device::{FakeDevice, Fault};
 
-/// Nothing here takes so long, however busy the machine is.
+/// Nothing here takes this long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
 const WAIT: Duration = Duration::from_millis(50);
 
@@ -24,7 +24,7 @@ fn virtual_board(options: &'static str) -> Line {
     Line::new(options, move |_| cantap_virtual::open(options.parse().unwrap()), listen)
 }
 
-/// Devices one after the other, each with its fault; after the last there is none for so long as the port is silent.
+/// Devices one after the other, each with its fault; after the last there is none for as long as the port is silent.
 fn fake_board(faults: &[Fault], silent: Duration) -> Line {
     let mut faults = VecDeque::from(faults.to_vec());
     Line::new(

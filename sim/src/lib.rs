@@ -1,7 +1,9 @@
-//! Our rig on the emulated board: a capture host with its books, drivers for transmission, the addresses that the command
-//! understands, and the board as a USB device for a Linux kernel.
+#![doc = include_str!("../README.md")]
 //!
-//! The board itself is `cantap-emu`'s and knows nothing of this product; what it must be told of our boards is in [`board`].
+//! [`rig`] is a board with a capture host, which keeps books on every frame ([`capture`]); [`run`] is a whole run of it. [`drive`] and
+//! [`stream`] send, [`address`] reads the addresses that the command understands, [`usbip`] serves the board to a Linux kernel.
+//!
+//! The board itself is `cantap-emu`'s and knows nothing of this product; what it must know of our boards is in [`board`].
 //! Nothing here uses the firmware's library: this is an independent witness that sees only the ELF, and shares the wire protocol's types
 //! with it. Time is core cycles everywhere ([`CYCLES_PER_SECOND`]).
 

@@ -36,7 +36,7 @@ pub enum Pace {
 pub struct Manner {
     /// What happens while the client does not read.
     pub pace: Pace,
-    /// Emulated time passes at most so many times as fast as the wall's. A client on a busy machine has more time for
+    /// Emulated time passes at most this many times as fast as the wall's. A client on a busy machine has more time for
     /// each emulated millisecond if this is small.
     pub speed: f64,
     /// Both channels on one bus.
@@ -78,9 +78,9 @@ pub struct Witness {
 const PIECES: usize = 64;
 /// A read without bytes returns after this time.
 const READ_WAIT: Duration = Duration::from_millis(50);
-/// So long to wait before a client that lags is looked at again.
+/// How long to wait before looking again at a client that lags.
 const LAG_WAIT: Duration = Duration::from_micros(500);
-/// So far the emulation may lag behind the wall's clock before it gives the difference up.
+/// How far the emulation may lag behind the wall's clock before it gives the difference up.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
 
 /// A client's end of the byte stream. Neither direction waits.

@@ -88,7 +88,7 @@ pub struct Args {
     /// The host stops reading for this time, in the middle of the run.
     #[arg(long, value_name = "TIME", value_parser = seconds)]
     stall: Option<Duration>,
-    /// The host is behind a high-speed hub, and so many microframes pass from one packet to the next: 2 is 0.26 MB/s.
+    /// The host is behind a high-speed hub, and this many microframes pass from one packet to the next: 2 is 0.26 MB/s.
     #[arg(long, value_name = "MICROFRAMES", default_value = "0")]
     hub: u32,
     /// Replay this candump log at its own times, in place of generated frames.

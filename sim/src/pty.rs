@@ -5,10 +5,10 @@ use std::io;
 use std::os::fd::OwnedFd;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-use rustix::fs::{Mode, OFlags};
+use rustix::fs::OFlags;
 use rustix::io::Errno;
-use rustix::pty::OpenptFlags;
 use rustix::termios::OptionalActions;
+use rustix_openpty::openpty;
 
 /// Bytes that one exchange moves at most.
 const PIECE: usize = 4096;
@@ -16,7 +16,7 @@ const PIECE: usize = 4096;
 /// The device's end of a pseudo-terminal.
 #[derive(Debug)]
 pub struct Pty {
-    master: OwnedFd,
+    controller: OwnedFd,
     name: String,
     /// Whether a client had it open when it was last read.
     has_client: AtomicBool,
@@ -26,21 +26,17 @@ impl Pty {
     /// Opens one, in raw mode before anybody can know its name: a cooked terminal would change bytes and
     /// echo them.
     pub fn open() -> io::Result<Self> {
-        let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY;
-        let master = rustix::pty::openpt(flags)?;
-        rustix::pty::grantpt(&master)?;
-        rustix::pty::unlockpt(&master)?;
-        let path = rustix::pty::ptsname(&master, Vec::new())?;
-        let slave = rustix::fs::open(&path, OFlags::RDWR | OFlags::NOCTTY | OFlags::CLOEXEC, Mode::empty())?;
-        let mut settings = rustix::termios::tcgetattr(&slave)?;
+        let pair = openpty(None, None)?;
+        let mut settings = rustix::termios::tcgetattr(&pair.user)?;
         settings.make_raw();
-        rustix::termios::tcsetattr(&slave, OptionalActions::Now, &settings)?;
-        let status = rustix::fs::fcntl_getfl(&master)?;
-        rustix::fs::fcntl_setfl(&master, status | OFlags::NONBLOCK)?;
+        rustix::termios::tcsetattr(&pair.user, OptionalActions::Now, &settings)?;
+        let path = rustix::termios::ttyname(&pair.user, Vec::new())?;
+        let status = rustix::fs::fcntl_getfl(&pair.controller)?;
+        rustix::fs::fcntl_setfl(&pair.controller, status | OFlags::NONBLOCK)?;
         let name = path.into_string().map_err(|_| io::Error::other("the terminal's name is not text"))?;
         // With no other end open, reading says so; that is how the last client's close is seen. The settings stay.
-        drop(slave);
-        Ok(Self { master, name, has_client: AtomicBool::new(false) })
+        drop(pair.user);
+        Ok(Self { controller: pair.controller, name, has_client: AtomicBool::new(false) })
     }
 
     /// The name that clients open.
@@ -51,7 +47,7 @@ impl Pty {
     /// Takes what clients wrote, without waiting.
     pub fn read(&self) -> io::Result<Vec<u8>> {
         let mut bytes = vec![0; PIECE];
-        let read = rustix::io::read(&self.master, &mut bytes[..]);
+        let read = rustix::io::read(&self.controller, &mut bytes[..]);
         self.has_client.store(read != Err(Errno::IO), Ordering::Relaxed);
         let len = or_nothing(read)?;
         bytes.truncate(len);
@@ -65,7 +61,7 @@ impl Pty {
 
     /// Writes as much as the terminal takes and returns how much that was.
     pub fn write(&self, bytes: &[u8]) -> io::Result<usize> {
-        or_nothing(rustix::io::write(&self.master, &bytes[..bytes.len().min(PIECE)]))
+        or_nothing(rustix::io::write(&self.controller, &bytes[..bytes.len().min(PIECE)]))
     }
 }
 

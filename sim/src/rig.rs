@@ -24,7 +24,7 @@ pub const MS: u64 = 1000 * CYCLES_PER_US;
 const ENUMERATION_TIMEOUT: u64 = 3 * CYCLES_PER_SECOND;
 /// How long a request may take.
 const REQUEST_TIMEOUT: u64 = CYCLES_PER_SECOND;
-/// A stream that is silent for so long has nothing more to say.
+/// A stream that is silent for this long has nothing more to say.
 const SILENCE: u64 = 20 * MS;
 
 /// What went wrong on the bench, apart from wrong frames, which are the ledger's.
@@ -79,7 +79,7 @@ pub struct Rig {
     pub machine: Machine,
     /// What the device said.
     pub session: Session,
-    /// Whether it told the truth.
+    /// Whether what it says is true.
     pub ledger: Ledger,
     usb: Arc<Mutex<UsbPort>>,
     /// Channels whose frames are in the books.

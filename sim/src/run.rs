@@ -25,7 +25,7 @@ use cantap_emu::usb_host::Timing;
 pub const DEFAULT_BITRATE_BPS: u32 = 1_000_000;
 /// The first 16 exceptions are the core's own.
 const FIRST_INTERRUPT: u16 = 16;
-/// The device may take so long to empty its queue when the traffic has ended.
+/// The device may take this long to empty its queue when the traffic has ended.
 const DRAIN: u64 = 5 * CYCLES_PER_SECOND;
 /// Quiet time before the traffic begins and after it ends.
 const MARGIN: u64 = 2 * MS;
@@ -65,7 +65,7 @@ pub struct Options {
     /// Bit rate of both buses, in bit/s. Without, a run takes [`DEFAULT_BITRATE_BPS`], and a device that serves
     /// somebody else's host has buses at the rate at which that host opens the channel.
     pub bitrate_bps: Option<u32>,
-    /// The host stops reading for so long, in the middle of the run.
+    /// The host stops reading for this long, in the middle of the run.
     pub stall: Option<Duration>,
     /// Seed of the traffic.
     pub seed: u64,

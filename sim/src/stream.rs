@@ -22,7 +22,7 @@ const CYCLES_PER_TICK: u64 = CYCLES_PER_US / TICKS_PER_US;
 const REQUESTS: usize = 3;
 /// From the plan to its first frame.
 const LEAD: u64 = 100 * MS;
-/// A stream of which nothing ends for so long, after its first frame, has come to a halt.
+/// A stream of which nothing ends for this long, after its first frame, has come to a halt.
 const STANDSTILL: u64 = 200 * MS;
 /// Bits between two frames.
 const INTERMISSION_BITS: u64 = 3;

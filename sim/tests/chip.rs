@@ -28,7 +28,7 @@ fn led_is_lit(rig: &Rig) -> bool {
     rig.machine.board().output_pin(2, 12) == Some(false)
 }
 
-/// How often the LED changes in so many milliseconds.
+/// How often the LED changes in this many milliseconds.
 fn led_changes(rig: &mut Rig, ms: u64) -> usize {
     let mut lit = Vec::new();
     for _ in 0..ms {

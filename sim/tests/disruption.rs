@@ -19,7 +19,7 @@ const INSTANTS_PER_BOARD: u64 = 25;
 const MEGABIT: u32 = 1_000_000;
 /// Load that the test can afford.
 const LOAD_PERCENT: f64 = 30.0;
-/// The device may need so long to see that nobody is there: 3 ms of silence on the bus, and a tick.
+/// The device may need this long to see that nobody is there: 3 ms of silence on the bus, and a tick.
 const GRACE: u64 = 8 * MS;
 /// A capture after the device came back.
 const AGAIN: u64 = 4 * MS;

@@ -153,7 +153,7 @@ fn full_tables_on_both_channels_leave_usb_alive() {
         for channel in Channel::ALL {
             rig.close(channel).unwrap();
         }
-        // Every period is sent or told of.
+        // Every period is sent or reported.
         let ended = rig.status().unwrap();
         let periods = |from, to: u64| (to - from) / u64::from(SHORTEST_US * TICKS_PER_US) * 32;
         for channel in Channel::ALL {
@@ -181,7 +181,7 @@ fn full_tables_on_both_channels_leave_usb_alive() {
     }
 }
 
-/// A queue that is given up is told of frame by frame, and not all at once.
+/// A queue that is given up is reported frame by frame, and not all at once.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn an_aborted_queue_costs_the_other_channel_no_frame() {

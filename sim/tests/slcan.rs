@@ -1,4 +1,4 @@
-//! slcan (Lawicel) on the firmware's ELF: every letter with both of its answers, overruns that are told, and python-can
+//! slcan (Lawicel) on the firmware's ELF: every letter with both of its answers, overruns that are reported, and python-can
 //! unchanged.
 
 mod common;

@@ -145,7 +145,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// For so long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
+    /// For this long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
     /// for, and one that is due soon after it on the other channel, leave in time. For what is due later the alarm is set
     /// again, which takes less than half that time: the tasks that drain the FIFOs come before it.
     const fn patience_ticks<C: Clock>() -> u64 {
@@ -225,7 +225,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// Once a millisecond: keeps time going, reads what no interrupt tells, retries what found no room.
+    /// Once a millisecond: keeps time going, reads what no interrupt reports, retries what found no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
             self.on_channel_tick(channel, &mut traffic[channel.index()], clock);

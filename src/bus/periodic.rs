@@ -23,7 +23,7 @@ pub const MIN_PERIOD_TICKS: u32 = 47 * TICKS_PER_US;
 
 /// The table is looked at no more often than this, so that entries that become due one after another are found together.
 const LOOK_EVERY_TICKS: u64 = 20 * TICKS_PER_US as u64;
-/// Periods that passed without a frame are told no more often than this for each entry, with their number.
+/// Periods that passed without a frame are reported no more often than this for each entry, as a number.
 const TELL_EVERY_TICKS: u64 = TICK_HZ as u64 / 10;
 /// Records of those that one call writes at the end of a session on the bus: 8 take 20 µs, see `docs/architecture.md`.
 const TOLD_PER_CALL: usize = 8;
@@ -65,7 +65,7 @@ pub struct PeriodicTable {
     look_from: u64,
     /// Periods that passed without a frame, since [`Self::reset_counter`].
     overtaken: u32,
-    /// By slot, those of them that no record tells of yet. They outlive their entry.
+    /// By slot, those of them that no record reports yet. They outlive their entry.
     untold: [u32; PERIODIC_SLOTS],
     /// The slots that have some, and those of them whose turn it is: a bit for each.
     owed: u32,
@@ -119,7 +119,7 @@ impl PeriodicTable {
         self.remove_all();
     }
 
-    /// Forgets the entries and what was not told of them.
+    /// Forgets the entries and what was not reported of them.
     pub fn forget(&mut self) {
         self.remove_all();
         self.untold = [0; PERIODIC_SLOTS];
@@ -219,7 +219,7 @@ impl PeriodicTable {
         self.add_overtaken(slot, overtaken);
     }
 
-    /// Once a millisecond: tells how many periods of one entry passed without a frame. It waits for room rather than take what is
+    /// Once a millisecond: reports how many periods of one entry passed without a frame. It waits for room rather than take what is
     /// kept for what explains missing frames.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         if now >= self.tell_from {
@@ -232,14 +232,14 @@ impl PeriodicTable {
         }
     }
 
-    /// Tells all that is left to tell, a few records in each call; whether that was all.
+    /// Reports all that is left, a few records in each call; returns whether that was all.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         self.telling = self.owed;
         self.tell(recorder, now, TOLD_PER_CALL);
         self.owed == 0
     }
 
-    /// Writes so many records of those that are to be written now, if there is room.
+    /// Writes this many records of those that are to be written now, if there is room.
     fn tell<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64, most: usize) {
         for slot in slots(self.telling).take(most) {
             let tag = DEVICE_TAG + slot as u32;

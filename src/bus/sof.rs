@@ -13,7 +13,7 @@ use crate::{TICK_HZ, TICKS_PER_MS, TICKS_PER_US};
 /// How far from a SOF the registers are read. The pulse that latches the timer is twelve system clocks long (RM0090, "Peripheral SOFs"), and
 /// two microseconds are 288 of them: whichever of the registers is the slower one has followed by then.
 const EDGE_TICKS: u32 = 2 * TICKS_PER_US;
-/// A mark is due so long after the last one.
+/// A mark is due this long after the last one.
 const EVERY_TICKS: u32 = TICK_HZ;
 
 /// What is latched of the last start of frame.

@@ -173,7 +173,7 @@ impl Transmitter {
             self.failed = self.failed.wrapping_add(1);
             self.mailboxes.take(mailbox);
         }
-        // Their ends are told.
+        // How they ended is recorded.
         while traffic.take_finished().is_some() {}
     }
 
@@ -199,12 +199,12 @@ impl Transmitter {
         self.off = false;
     }
 
-    /// Once a millisecond: tells of periods that passed without a frame, not each but their number.
+    /// Once a millisecond: records periods that passed without a frame, by their number rather than one by one.
     pub fn tick<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) {
         self.periodic.tick(recorder, now);
     }
 
-    /// The channel is closed: tells what [`Self::tick`] has not told yet, a few records in each call. Returns whether that was all.
+    /// The channel is closed: records what [`Self::tick`] has not recorded yet, a little in each call. Returns whether that was all.
     pub fn tell_rest<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>, now: u64) -> bool {
         self.periodic.tell_rest(recorder, now)
     }
@@ -242,7 +242,7 @@ impl Transmitter {
     /// First part of [`Self::on_finished`]: empties the mailboxes that have finished. [`Self::prepare_head`] may follow before
     /// [`Self::record`], so that a busy bus need not wait for the record.
     ///
-    /// The first ended at `ended`. What else has finished by now did so later, nobody knows when: its time is when it was found.
+    /// The first ended at `ended`. Whatever else has finished did so later, at a time that is not known: it is given the time at which it was found.
     pub fn collect(
         &mut self,
         traffic: &mut impl Traffic,
@@ -385,7 +385,7 @@ impl Transmitter {
         if self.can_load() { self.periodic.due() } else { NEVER }
     }
 
-    /// The next time at which [`Self::service`] has something to do that no interrupt of the controller tells.
+    /// The next time at which [`Self::service`] has something to do that no interrupt of the controller announces.
     #[inline]
     pub fn next_due(&self) -> u64 {
         if !self.can_load() {

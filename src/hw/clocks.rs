@@ -20,7 +20,7 @@ const USB_HZ: u32 = 48_000_000;
 pub const HSI_HZ: u32 = 16_000_000;
 /// Cycles that a turn of cortex-m's waiting loop takes on this core, at least (cortex-m 0.7, `asm::delay`).
 const CYCLES_PER_TURN: u32 = 3;
-/// A crystal that has not started after so long, in ms, does not start: the data sheet says 2 ms typically (STM32F405, "HSE
+/// A crystal that has not started after this long, in ms, does not start: the data sheet says 2 ms typically (STM32F405, "HSE
 /// 4-26 MHz oscillator characteristics"), ST's drivers give it 100.
 const CRYSTAL_MS: u32 = 100;
 /// Reads of a register for which a switch over is waited: it takes a few clocks.
@@ -51,7 +51,7 @@ pub fn back_to_hsi(rcc: &pac::RCC, flash: &pac::FLASH) {
     flash.acr().modify(|_, w| w.icrst().clear_bit().dcrst().clear_bit());
 }
 
-/// Waits, with a processor's clock of so many Hz; rather too long than too short.
+/// Waits, with a processor's clock of this many Hz; rather too long than too short.
 pub fn wait_ms(ms: u32, hz: u32) {
     cortex_m::asm::delay(ms * (hz / 1_000 / CYCLES_PER_TURN));
 }

@@ -11,6 +11,8 @@ use cantap_wire::message::Failures;
 use cortex_m::peripheral::SCB;
 use cortex_m_rt::exception;
 
+use super::message;
+
 #[unsafe(link_section = ".uninit.cantap_failures")]
 static mut LOG: MaybeUninit<FailureLog> = MaybeUninit::uninit();
 
@@ -33,11 +35,17 @@ pub fn failures() -> Failures {
     load().failures()
 }
 
-/// Leaves word and restarts: a device that restarts is there again in a second, one that stands still never.
+/// Restarts the firmware, which has failed and recorded why.
+pub fn restart() -> ! {
+    message::leave(message::FAILED);
+    SCB::sys_reset()
+}
+
+/// Records the failure and restarts: a device that restarts is back within a second; one that halts never comes back.
 fn fail(what: fmt::Arguments) -> ! {
     cortex_m::interrupt::disable();
     record(what);
-    super::restart::after_failure()
+    restart()
 }
 
 #[panic_handler]

@@ -34,7 +34,7 @@ fn clear_flags(flash: &FLASH) {
     });
 }
 
-/// Whether the last operation told of no error.
+/// Whether the last operation reported no error.
 fn went_well(flash: &FLASH) -> bool {
     let sr = flash.sr().read();
     !(sr.operr().is_active()

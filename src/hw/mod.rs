@@ -11,6 +11,7 @@ mod entry;
 mod failure;
 mod flash;
 mod leds;
+mod message;
 mod restart;
 mod sensors;
 pub mod sof;
@@ -104,7 +105,7 @@ fn show_no_crystal(leds: &mut Leds, watchdog: &mut watchdog::Watchdog) -> ! {
         watchdog.feed();
         clocks::wait_ms(1, clocks::HSI_HZ);
     }
-    restart::after_failure()
+    failure::restart()
 }
 
 /// Keeps the processor's clock on for a debugger while the processor sleeps (RM0090, DBGMCU_CR, DBG_SLEEP). It costs some of

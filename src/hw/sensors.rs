@@ -8,7 +8,7 @@ use stm32f4xx_hal::signature::{VDDA_CALIB, VrefCal, VtempCal30, VtempCal110};
 const TEMPERATURE: u8 = 16;
 /// ADC1's channel of the internal reference voltage.
 const REFERENCE: u8 = 17;
-/// A conversion takes 480 + 12 clocks at 18 MHz, 27 µs; so many reads of a register take longer. The bound keeps
+/// A conversion takes 480 + 12 clocks at 18 MHz, 27 µs; this many reads of a register take longer. The bound keeps
 /// a chip without an ADC from hanging.
 const MOST_READS: u32 = 10_000;
 /// Longest sampling time, 480 clocks at 18 MHz = 27 µs; the sensors ask for 10 µs (STM32F405 data sheet,

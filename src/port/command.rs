@@ -21,10 +21,10 @@ use sending::{set_periodic, set_trigger};
 pub use settings::MAX_SAVED;
 use settings::{ChannelSettings, saved, store};
 
-/// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After so long the
+/// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After this long the
 /// bus is stuck, and the controller is made to leave.
 const STOP_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
-/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, looks every 10 ms). After so long it
+/// A controller that is made to leave takes a moment (Linux's driver, `drivers/net/can/bxcan.c`, looks every 10 ms). After this long it
 /// has no clock, or is broken.
 const HALT_WITHIN_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Time for the answer to reach the host before the device restarts.

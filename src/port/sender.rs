@@ -9,7 +9,7 @@ use cantap_wire::record::{self, Outline};
 use crate::TICKS_PER_MS;
 use crate::bus::queue::Consumer;
 
-/// A batch is sent when it is full, or so long after its first record came.
+/// A batch is sent when it is full, or this long after its first record came.
 const FLUSH_AFTER_TICKS: u32 = TICKS_PER_MS;
 
 /// Turns queued records into batches.

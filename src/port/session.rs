@@ -51,7 +51,7 @@ enum Slept {
     No,
     /// The channels leave their buses.
     Leaving,
-    /// They had left at this time, and the host is to be told behind what is queued.
+    /// They had left at this time, which the host is to hear behind what is queued.
     Since(u64),
 }
 
@@ -175,7 +175,7 @@ impl<'q, const N: usize> Session<'q, N> {
     }
 
     /// Takes every packet that is there: one left in the USB peripheral would hold up the control pipe behind it. So the host is
-    /// made to wait before there is no room for what is on its way. What finds none all the same is dropped and counted.
+    /// made to wait before there is no room for what is on its way. What finds no room even so is dropped and counted.
     fn read(&mut self, port: &mut impl Port) {
         loop {
             self.hold(port);
@@ -243,7 +243,7 @@ impl<'q, const N: usize> Session<'q, N> {
         }
     }
 
-    /// The first byte tells the language. A zero changes to the native one at any time.
+    /// The first byte decides the language. A zero changes to the native one at any time.
     fn choose_language(&mut self, board: &mut impl Board<'q, N>) -> bool {
         let Some(first) = self.inbox.first() else { return false };
         match first {
@@ -281,7 +281,7 @@ impl<'q, const N: usize> Session<'q, N> {
         true
     }
 
-    /// Queues the frames of the request to send, of so many bytes; returns whether it is one.
+    /// Queues the frames of the request to send, of this many bytes; returns whether it is one.
     ///
     /// Not inlined, nor is what does the other requests: neither is to take the stack that only the other needs.
     #[inline(never)]
@@ -293,7 +293,7 @@ impl<'q, const N: usize> Session<'q, N> {
         true
     }
 
-    /// Does what the request, of so many bytes, asks for.
+    /// Does what the request, of this many bytes, asks for.
     #[inline(never)]
     fn execute(&mut self, len: usize, greeted: bool, board: &mut impl Board<'q, N>) {
         let message = &self.request[..len];

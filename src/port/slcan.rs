@@ -28,7 +28,7 @@ const SJA1000_HZ: u32 = 8_000_000;
 const STAMP_WRAP_MS: u64 = 60_000;
 /// Longest line that a frame makes: `T`, 8 identifier, 1 DLC, 16 data, 8 stamp, CR.
 const MAX_FRAME_LINE: usize = 1 + 8 + 1 + 16 + 8 + 1;
-/// A frame waits so long for room in a queue from which nothing leaves: no frame at 10 kbit/s and above takes longer.
+/// A frame waits this long for room in a queue from which nothing leaves: no frame at 10 kbit/s and above takes longer.
 const FULL_TICKS: u32 = 100 * TICKS_PER_MS;
 /// Lines for one filling of the outbox.
 const MAX_LINES_BYTES: usize = 1024;
@@ -128,7 +128,7 @@ impl Slcan {
     }
 
     /// Whether a line that begins so must wait: a frame to be sent, for room in the queue. Few programs look at the answers, and a
-    /// refused frame would be lost to them. When nothing has left for a while, it is refused all the same.
+    /// refused frame would be lost to them. When nothing has left for a while, it is refused even so.
     pub fn must_wait<'q, const N: usize>(
         &mut self,
         first: Option<u8>,
@@ -415,7 +415,7 @@ impl Slcan {
         let _ = lines.push(b'\r');
     }
 
-    /// Keeps what `F` tells.
+    /// Keeps what `F` reports.
     fn note(&mut self, event: &Event) {
         self.flags |= match event {
             Event::Lost { stage: LossStage::Controller, .. } => flag::OVERRUN,

@@ -236,7 +236,7 @@ impl Chip for FakeChip {
     }
 }
 
-/// A port whose host takes so many transfers and then none.
+/// A port whose host takes a number of transfers and then none.
 #[derive(Default)]
 pub struct FakePort {
     pub open: bool,
@@ -244,7 +244,7 @@ pub struct FakePort {
     pub to_device: VecDeque<Vec<u8>>,
     pub from_device: Vec<u8>,
     pub packets: Vec<usize>,
-    /// The host was told to wait.
+    /// The host was made to wait.
     pub held: bool,
     /// Transfers that the host still takes.
     pub takes: usize,

@@ -184,7 +184,7 @@ impl Decoder {
                     report(Decoded::Ended { ticks: header.base_ticks, reason });
                 }
             }
-            // A Hello whose fixed first field tells another version is not read any further.
+            // A Hello whose fixed first field gives another version is not read any further.
             Ok((DeviceMessage::Response(response), [])) => {
                 if let Some(version) = foreign_protocol(message) {
                     return report(Decoded::OtherProtocol(version));

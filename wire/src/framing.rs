@@ -1,7 +1,9 @@
-//! How a message stands in the byte stream: COBS of (message, CRC), then a zero byte.
+//! How a message is framed in the byte stream: COBS of (message, CRC), then a zero byte.
 //!
 //! COBS only says where a message ends; a damaged message can still be well-formed COBS. The CRC
 //! is what proves it.
+
+use core::fmt;
 
 use crc::Crc;
 use serde::Serialize;
@@ -11,7 +13,7 @@ pub const MAX_MESSAGE: usize = 2048;
 /// Largest request before CRC and COBS, in bytes: what a device must be ready to hold. The longest there is sets
 /// [`MAX_FILTERS`](crate::message::MAX_FILTERS) filters of 12 bytes each.
 pub const MAX_REQUEST: usize = 704;
-/// Bytes of the CRC, which stands little-endian behind the message.
+/// Bytes of the CRC, which follows the message, little-endian.
 pub const CRC_LEN: usize = 4;
 
 /// Bytes that a message of `len` bytes takes on the wire at most: CRC, one COBS byte for each
@@ -55,6 +57,18 @@ pub enum FramingError {
     Crc,
 }
 
+impl fmt::Display for FramingError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Cobs => "not COBS",
+            Self::Short => "shorter than a CRC",
+            Self::Crc => "the CRC does not match",
+        })
+    }
+}
+
+impl core::error::Error for FramingError {}
+
 /// Writes `message` to `out` as it goes over the wire and returns the length. `buffer` is room for the message and its CRC.
 /// `None` if either is too short.
 pub fn encode(message: &impl Serialize, buffer: &mut [u8], out: &mut [u8]) -> Option<usize> {
@@ -87,7 +101,7 @@ pub fn seal_with(
     Some(encoded + 1)
 }
 
-/// Decodes what stands between two zero bytes into `out`, which must be at least as long, and
+/// Decodes what is between two zero bytes into `out`, which must be at least as long, and
 /// returns the message without its CRC.
 pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], FramingError> {
     if out.len() < encoded.len() {

@@ -56,7 +56,7 @@ pub enum DeviceMessage {
     Ended(SessionEnd),
 }
 
-/// Told behind everything else of a session that the device has ended by itself. What is asked then, except `Hello`, is
+/// Sent behind everything else of a session that the device has ended by itself. What is asked then, except `Hello`, is
 /// refused with [`Refusal::NoSession`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct SessionEnd {
@@ -158,7 +158,7 @@ pub enum Command {
     },
     /// Shows an LED pattern, to find the device among others.
     Identify {
-        /// For so long.
+        /// For this long.
         seconds: u8,
     },
     /// Restarts the firmware after the response is sent.

@@ -1,6 +1,6 @@
 //! Records: what a device saw or did, in the order of its capture queue.
 //!
-//! A record begins with one byte that tells the kind:
+//! A record begins with a byte that gives its kind:
 //!
 //! | first byte | then |
 //! |---|---|
@@ -86,9 +86,9 @@ pub enum TransmitFailure {
     Closed,
     /// The controller went bus-off and recovery is manual.
     BusOff,
-    /// A periodic frame's next periods began before the bus took it. The frame still waits, and its end is told once.
+    /// A periodic frame's next periods began before the bus took it. The frame still waits, and its end is reported once.
     Overtaken {
-        /// How many, since this was told last for the entry.
+        /// How many, since the entry's last such record.
         periods: u32,
     },
 }

@@ -1,11 +1,14 @@
-//! The project's own build steps: `cargo xtask firmware | test | size | bench | soak | dist`.
+//! The project's own build steps: `cargo xtask firmware | test | circles | links | size | bench | soak | dist`.
 //!
-//! Kept light, because `cargo fw` builds it first: what only the benchmarks need hides behind a feature.
+//! Kept light, because `cargo fw` builds it first: what only measurements and checks need is behind features.
 
 #![forbid(unsafe_code)]
 
 mod bench;
 mod board;
+mod check;
+#[cfg(feature = "check")]
+mod circles;
 mod compiler;
 mod cross;
 mod dependencies;
@@ -13,6 +16,8 @@ mod dist;
 mod features;
 mod firmware;
 mod kernel;
+#[cfg(feature = "check")]
+mod links;
 mod metadata;
 mod outcome;
 mod package;
@@ -44,6 +49,10 @@ enum Task {
     Firmware(firmware::Args),
     /// Does everything that must hold before a change lands, from a fresh clone on.
     Test(test::Args),
+    /// Finds files of one crate that import each other in a circle, and public types of one crate that share a name.
+    Circles,
+    /// Finds links in the pages that lead nowhere, and files named there that do not exist.
+    Links,
     /// Prints each board's flash and static RAM, and fails past `size-budget.toml`.
     Size,
     /// Measures speed and size.
@@ -58,6 +67,8 @@ fn main() -> ExitCode {
     let result = match Cli::parse().task {
         Task::Firmware(args) => firmware::run(&args),
         Task::Test(args) => test::run(&args),
+        Task::Circles => check::circles(),
+        Task::Links => check::links(),
         Task::Size => size::run(),
         Task::Bench(args) => bench::run(&args),
         Task::Soak(args) => soak::run(&args),

@@ -10,8 +10,8 @@ use crate::outcome::Outcome;
 use crate::peers::Peers;
 use crate::toolchain::Toolchain;
 use crate::{
-    compiler, cross, dependencies, features, firmware, kernel, package, reproducible, size, tests, typos,
-    workspace,
+    check, compiler, cross, dependencies, features, firmware, kernel, package, reproducible, size, tests,
+    typos, workspace,
 };
 
 /// What `cargo xtask test` takes.
@@ -29,6 +29,8 @@ enum Step {
     Fmt,
     /// Spelling.
     Typos,
+    /// Links in the pages, and files that they name.
+    Links,
     /// Other people's crates: licences, duplicates, sources.
     Dependencies,
     /// The compiler is the oldest that the packages promise to build with, or that one is tried.
@@ -95,6 +97,7 @@ impl Step {
         match self {
             Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
             Step::Typos => return typos::check(shell),
+            Step::Links => check::links()?,
             Step::Dependencies => dependencies::check(shell)?,
             Step::OldestCompiler => return compiler::check(shell),
             Step::Clippy => {

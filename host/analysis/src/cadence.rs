@@ -1,6 +1,6 @@
 //! How often something comes, and when it has been silent for long.
 
-/// Intervals that are remembered. Of so many the middle one is their usual length, whatever a few of them are.
+/// How many intervals are remembered. The middle one of them is the usual length, whatever a few of them are.
 const REMEMBERED: usize = 15;
 
 /// So many times its usual interval without a new value is silence, and no slow change.
@@ -37,7 +37,7 @@ impl Cadence {
         silent
     }
 
-    /// Whether an interval of so many nanoseconds is much longer than usual. Of the first nobody can tell.
+    /// Whether an interval of this many nanoseconds is much longer than usual. Of the first nobody can tell.
     pub fn is_silence(&self, interval_ns: i64) -> bool {
         let known = self.count.min(REMEMBERED);
         let mut intervals = self.intervals;

@@ -4,6 +4,7 @@
 //! line with the details in a trailing comment. Everything else that is known of such files (statistics, other
 //! buses, markers) is counted by its kind. Dates are taken as UTC.
 
+mod content;
 mod decode;
 mod encode;
 mod others;

@@ -8,6 +8,8 @@
 use std::collections::VecDeque;
 use std::io;
 
+use base64::Engine;
+use base64::engine::general_purpose::STANDARD;
 use cantap_wire::{Frame, Id};
 
 use super::analyser;
@@ -178,7 +180,7 @@ fn python_can(line: &[u8], error_frames: &mut ErrorFrames) -> Result<Row, Fault>
     let time_ns = python_time(time).ok_or_else(|| Fault::malformed("a time in seconds", time))?;
     let digits = id.strip_prefix(b"0x").unwrap_or(id);
     let raw = text::hex(digits).ok_or_else(|| Fault::malformed("an identifier such as 0x123", id))?;
-    let bytes = base64(data).ok_or_else(|| Fault::malformed("up to 64 bytes in base64", data))?;
+    let bytes = decode_base64(data).ok_or_else(|| Fault::malformed("up to 64 bytes in base64", data))?;
     let mut padded = [0; 8];
     let present = bytes.len().min(8);
     padded[..present].copy_from_slice(&bytes[..present]);
@@ -286,39 +288,16 @@ fn full(line: &[u8]) -> Result<TraceRecord, Fault> {
     Ok(TraceRecord { time_ns, channel, event })
 }
 
-const BASE64: &[u8; 64] = b"ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz0123456789+/";
-
 fn push_base64(out: &mut Vec<u8>, bytes: &[u8]) {
-    for group in bytes.chunks(3) {
-        let [a, b, c] = [0, 1, 2].map(|at| group.get(at).copied().unwrap_or(0));
-        let bits = u32::from(a) << 16 | u32::from(b) << 8 | u32::from(c);
-        for at in 0..4 {
-            let digit = BASE64[(bits >> (18 - 6 * at) & 63) as usize];
-            out.push(if at > group.len() { b'=' } else { digit });
-        }
-    }
+    // Four digits for three bytes, padded.
+    let mut digits = [0; FD_MAX_BYTES.div_ceil(3) * 4];
+    let len = STANDARD.encode_slice(bytes, &mut digits).unwrap_or(0);
+    out.extend_from_slice(&digits[..len]);
 }
 
 /// Up to 64 bytes.
-fn base64(text: &[u8]) -> Option<Vec<u8>> {
-    const LONGEST: usize = 88;
-    if !text.len().is_multiple_of(4) || text.len() > LONGEST {
-        return None;
-    }
-    let mut bytes = Vec::with_capacity(8);
-    for (at, group) in text.chunks(4).enumerate() {
-        let padding = group.iter().rev().take_while(|digit| **digit == b'=').count();
-        if padding > 2 || padding > 0 && 4 * (at + 1) != text.len() {
-            return None;
-        }
-        let mut bits = 0_u32;
-        for digit in &group[..4 - padding] {
-            bits = bits << 6 | BASE64.iter().position(|known| known == digit)? as u32;
-        }
-        bits <<= 6 * padding;
-        bytes.extend_from_slice(&bits.to_be_bytes()[1..4 - padding]);
-    }
-    Some(bytes)
+fn decode_base64(text: &[u8]) -> Option<Vec<u8>> {
+    STANDARD.decode(text).ok().filter(|bytes| bytes.len() <= FD_MAX_BYTES)
 }
 
 /// Microseconds, and nanoseconds only where there are any.
@@ -489,7 +468,7 @@ mod tests {
         fn base64_round_trips(bytes in prop::collection::vec(any::<u8>(), 0..=64)) {
             let mut text = Vec::new();
             push_base64(&mut text, &bytes);
-            prop_assert_eq!(base64(&text), Some(bytes));
+            prop_assert_eq!(decode_base64(&text), Some(bytes));
         }
     }
 

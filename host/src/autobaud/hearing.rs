@@ -1,4 +1,4 @@
-//! What a received frame tells of the bus's bit rate: at which rates a receiver with this bit timing takes just this
+//! What a received frame says about the bus's bit rate: at which rates a receiver with this bit timing takes just this
 //! frame, and at which it would have seen an error.
 //!
 //! A controller resynchronises, so it hears rates beside its own: 250 kbit/s as well as 253.97, if its sample point is not

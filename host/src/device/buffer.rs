@@ -11,7 +11,7 @@ use cantap_wire::record::LossStage;
 use super::DeviceError;
 use crate::{TraceEvent, TraceRecord};
 
-/// Records that are not frames may go beyond the capacity by so many, so that what explains a gap is kept.
+/// Records that are not frames may go beyond the capacity by this many, so that what explains a gap is kept.
 const RESERVE: usize = 65_536;
 /// Used-up vectors kept for the next batches.
 const SPARES: usize = 4;

@@ -144,6 +144,7 @@ pub enum DeviceError {
 
 /// How it shows that a session is over.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
 pub enum SessionOver {
     /// The device says that the computer suspended it.
     Suspended,
@@ -180,7 +181,7 @@ impl fmt::Display for SessionOver {
     }
 }
 
-/// Why a connection is of no use any more; kept to be told to everybody who asks for something.
+/// Why a connection is of no use any more; kept as the answer to every later request.
 #[derive(Clone, Debug)]
 pub(super) enum Gone {
     Vanished(String),
@@ -221,6 +222,7 @@ pub(crate) fn no_timing(bitrate_bps: u32, reason: &NoTiming) -> String {
                 nearest.join(" and ")
             )
         }
+        other => format!("{bitrate_bps} bit/s: {other}"),
     }
 }
 

@@ -9,7 +9,7 @@ use cantap_wire::record::{Event, LossStage, Record, Stamp, TransmitFailure};
 use cantap_wire::{CHANNELS, Channel, Corruption, Decoded, Decoder, Frame, Reply, Response};
 
 use super::clock::{ClockMap, SofMark, Ticks, UtcClock};
-use super::stamps::{BitLengths, tighten};
+use super::stamps::{BitLengths, Stamped, tighten};
 use crate::{Direction, TraceEvent, TraceRecord};
 
 /// Bytes decoded at a time: their records stay in the processor's cache through every pass.
@@ -20,7 +20,7 @@ pub const PIECE_BYTES: usize = 4096;
 pub struct ChannelCounters {
     /// Frames that arrived from the device.
     pub received: u64,
-    /// Times the controller's FIFO overran: at least so many frames were lost.
+    /// Times the controller's FIFO overran: at least this many frames were lost.
     pub lost_controller: u64,
     /// Frames that found the device's queue full.
     pub lost_queue: u64,
@@ -120,6 +120,8 @@ pub enum Notice {
 /// One device's stream.
 pub struct Intake {
     decoder: Decoder,
+    /// What was decoded and is not placed in time yet.
+    stamped: Vec<Stamped>,
     records: Vec<TraceRecord>,
     lengths: BitLengths,
     clock: ClockMap,
@@ -139,6 +141,7 @@ impl Intake {
         let utc = UtcClock::start();
         Self {
             decoder: Decoder::new(),
+            stamped: Vec::new(),
             records: Vec::new(),
             lengths: BitLengths::default(),
             clock: ClockMap::new(cantap_tick_hz_before_hello(), utc.at(Instant::now())),
@@ -153,8 +156,18 @@ impl Intake {
     /// Takes at most [`PIECE_BYTES`] (more is fine, and slower), reports notices, and returns the records, to
     /// be taken out of the vector.
     pub fn push(&mut self, bytes: &[u8], mut notice: impl FnMut(Notice)) -> &mut Vec<TraceRecord> {
-        let Self { decoder, records, counters, clock, in_session, lengths, last_ns, utc, latest_ticks } =
-            self;
+        let Self {
+            decoder,
+            stamped,
+            records,
+            counters,
+            clock,
+            in_session,
+            lengths,
+            last_ns,
+            utc,
+            latest_ticks,
+        } = self;
         let mut last_ticks = None;
         let mut ended = None;
         counters.bytes += bytes.len() as u64;
@@ -163,8 +176,8 @@ impl Intake {
             Decoded::Record { ticks, record: Record::Received(received) } => {
                 last_ticks = Some(ticks);
                 counters.channels[received.channel.index()].received += 1;
-                records.push(TraceRecord {
-                    time_ns: ticks as i64,
+                stamped.push(Stamped {
+                    at: Ticks(ticks),
                     channel: received.channel.number(),
                     event: TraceEvent::Frame {
                         frame: received.frame.into(),
@@ -175,14 +188,14 @@ impl Intake {
             }
             Decoded::Record { ticks, record: Record::Event(event) } => {
                 last_ticks = Some(ticks);
-                on_event(event, ticks, counters, clock, records, &mut notice);
+                on_event(event, Ticks(ticks), counters, clock, stamped, &mut notice);
             }
             Decoded::BatchesLost { frames, .. } => {
                 for (channel, count) in Channel::ALL.into_iter().zip(frames) {
                     counters.channels[channel.index()].lost_link += u64::from(count);
                     // Its time is known when the next record is; zero stands for "not earlier than the last".
-                    let ticks = last_ticks.unwrap_or(0);
-                    records.extend(lost(channel, ticks, LossStage::Link, count, false));
+                    let at = Ticks(last_ticks.unwrap_or(0));
+                    stamped.extend(lost(channel, at, LossStage::Link, count, false));
                 }
             }
             Decoded::Response(response) => {
@@ -190,6 +203,7 @@ impl Intake {
                 if let (Ok(Reply::Hello(answer)), false) = (&response.result, *in_session) {
                     // What stands before belongs to a session that is over.
                     *in_session = true;
+                    stamped.clear();
                     records.clear();
                     last_ticks = None;
                     *latest_ticks = 0;
@@ -224,13 +238,14 @@ impl Intake {
     /// Tightens the new records, maps them to UTC and puts them in order. A channel whose stamps were moved
     /// back may now stand before the other's; nothing moves to before what was already handed over.
     fn place_in_time(&mut self) {
-        tighten(&mut self.records, &self.lengths);
+        tighten(&mut self.stamped, &self.lengths);
         let mut sorted = true;
         let mut previous = self.last_ns;
-        for record in &mut self.records {
-            record.time_ns = self.clock.utc(Ticks(record.time_ns as u64)).0.max(self.last_ns);
-            sorted &= record.time_ns >= previous;
-            previous = record.time_ns;
+        for Stamped { at, channel, event } in self.stamped.drain(..) {
+            let time_ns = self.clock.utc(at).0.max(self.last_ns);
+            sorted &= time_ns >= previous;
+            previous = time_ns;
+            self.records.push(TraceRecord { time_ns, channel, event });
         }
         if !sorted {
             self.sort();
@@ -288,7 +303,7 @@ impl Intake {
         }
     }
 
-    /// Adds losses that only the device's own counters tell of, at the end of a session.
+    /// Adds losses that only the device's own counters show, at the end of a session.
     pub fn add_losses(&mut self, channel: Channel, stage: LossStage, count: u32) -> &mut Vec<TraceRecord> {
         let counters = &mut self.counters.channels[channel.index()];
         match stage {
@@ -297,7 +312,7 @@ impl Intake {
             LossStage::Link => counters.lost_link += u64::from(count),
             LossStage::Host => counters.lost_host += u64::from(count),
         }
-        self.records.extend(lost(channel, 0, stage, count, stage == LossStage::Controller));
+        self.stamped.extend(lost(channel, Ticks(0), stage, count, stage == LossStage::Controller));
         self.place_in_time();
         &mut self.records
     }
@@ -309,23 +324,23 @@ impl Default for Intake {
     }
 }
 
-/// No record is kept before `Hello` tells the tick rate; any number will do.
+/// No record is kept before `Hello` gives the tick rate; any number will do.
 const fn cantap_tick_hz_before_hello() -> u32 {
     1_000_000
 }
 
-fn lost(channel: Channel, ticks: u64, stage: LossStage, count: u32, at_least: bool) -> Option<TraceRecord> {
+fn lost(channel: Channel, at: Ticks, stage: LossStage, count: u32, at_least: bool) -> Option<Stamped> {
     let event = TraceEvent::Lost { stage: Some(stage), count, at_least };
-    (count > 0).then_some(TraceRecord { time_ns: ticks as i64, channel: channel.number(), event })
+    (count > 0).then_some(Stamped { at, channel: channel.number(), event })
 }
 
 /// Everything that is not a received frame.
 fn on_event(
     event: Event,
-    ticks: u64,
+    at: Ticks,
     counters: &mut Counters,
     clock: &mut ClockMap,
-    records: &mut Vec<TraceRecord>,
+    stamped: &mut Vec<Stamped>,
     notice: &mut impl FnMut(Notice),
 ) {
     let (channel, event) = match event {
@@ -347,20 +362,20 @@ fn on_event(
             (channel, TraceEvent::State { state, counters: Some((tec, rec)) })
         }
         Event::Transmitted { channel, tag, frame } => {
-            let time_ns = clock.utc(Ticks(ticks)).0;
+            let (ticks, time_ns) = (at.0, clock.utc(at).0);
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Ok(frame) }));
             (channel, TraceEvent::Frame { frame: frame.into(), direction: Direction::Tx, late: false })
         }
         Event::TransmitFailed { channel, tag, reason } => {
-            let time_ns = clock.utc(Ticks(ticks)).0;
+            let (ticks, time_ns) = (at.0, clock.utc(at).0);
             notice(Notice::Transmission(Transmission { channel, tag, ticks, time_ns, result: Err(reason) }));
             (channel, TraceEvent::TransmitFailed { tag, reason })
         }
         Event::Stopped { channel } => return notice(Notice::Stopped(channel)),
         Event::SofMark { frame, doubled } => {
-            return clock.mark(SofMark { frame, at: Ticks(ticks), doubled });
+            return clock.mark(SofMark { frame, at, doubled });
         }
         Event::Started { .. } => return,
     };
-    records.push(TraceRecord { time_ns: ticks as i64, channel: channel.number(), event });
+    stamped.push(Stamped { at, channel: channel.number(), event });
 }

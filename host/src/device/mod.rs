@@ -3,7 +3,7 @@
 //! [`Device::open`] connects to a serial port, [`Device::over`] to whatever makes a [`Link`]; [`Device::records`] hands out
 //! what is captured, the other methods are requests.
 //! A thread of its own reads the port, so that a slow program loses nothing as long as the buffer lasts, and
-//! is told exactly what it lost after that.
+//! is shown exactly what it lost after that.
 
 mod buffer;
 mod clock;
@@ -52,13 +52,13 @@ use reader::{Answer, Order, Shared};
 const BUFFER_RECORDS: usize = 1 << 20;
 /// A request is given up after this time.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
-/// `Hello` is tried so often, since a device may have half a line of somebody else's in its input.
+/// How often `Hello` is tried: a device may have half a line of somebody else's in its input.
 const HELLO_TRIES: u32 = 3;
 /// So long for each try.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 /// Round trips that set the clock at the start.
 const CLOCK_ROUNDS: u32 = 8;
-/// A closing channel's last records are given up when none has come for so long.
+/// A closing channel's last records are given up when none has come for this long.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 /// Transmissions that a subscriber may leave waiting.
 const TRANSMISSIONS: usize = 65_536;
@@ -319,7 +319,7 @@ impl Device {
     }
 
     /// The map from the device's time to UTC as it is now, with the marks that it is made of. It goes on for as long as
-    /// crystals keep their rate: some seconds. Before the device has told its time, one that maps tick 0 to the epoch.
+    /// crystals keep their rate: some seconds. Before the device's time is known, one that maps tick 0 to the epoch.
     pub fn clock_map(&self) -> Arc<ClockMap> {
         self.shared.clock_map().unwrap_or_else(|| Arc::new(ClockMap::new(self.hello.tick_hz, UtcNs(0))))
     }

@@ -23,7 +23,7 @@ use super::{DeviceError, SessionOver};
 
 /// Read at a time; an operating system's serial buffer is smaller.
 const READ_BYTES: usize = 64 * 1024;
-/// A device makes the host wait while it has no room; one that takes nothing for so long is stuck.
+/// A device makes the host wait while it has no room; one that takes nothing for this long is stuck.
 const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
 /// What a request's answer can be.
@@ -33,13 +33,13 @@ pub(super) enum Answer {
     OtherProtocol(u16),
 }
 
-/// What the reader is told from outside.
+/// What the reader is asked for from outside.
 pub(super) enum Order {
     /// A channel's bits are this long from now on: clocks of the controller per bit, its clock, tick rate.
     BitLength { channel: Channel, clocks_per_bit: u32, clock_hz: u32, tick_hz: u32 },
     /// The samples of the clock so far are the first; start from the best.
     SettleClock,
-    /// Losses that only the device's counters tell of.
+    /// Losses that only the device's counters show.
     Losses { channel: Channel, stage: LossStage, count: u32 },
     /// Nothing more is expected.
     Finish,

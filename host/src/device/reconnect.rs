@@ -18,7 +18,7 @@ use crate::{TraceEvent, TraceRecord};
 /// How long after a failure it is tried again.
 const RETRY_AFTER: Duration = Duration::from_millis(500);
 
-/// What came next. `E` is how the caller tells errors.
+/// What came next. `E` is the caller's error.
 #[derive(Debug)]
 pub enum Happening<E> {
     /// Records, or none within the time.
@@ -89,7 +89,7 @@ pub struct Reconnecting<D, E> {
     clock: ClockReport,
     /// When it was noticed that the device is gone, and how long it had been then.
     gone: Option<(Instant, Duration)>,
-    /// What was told last, so that nothing is told twice.
+    /// What was last reported, so that nothing is reported twice.
     told: Option<String>,
     retry_at: Instant,
     /// Time of the last record handed out.

@@ -17,13 +17,13 @@ const NOMINAL_BAUD: u32 = 115_200;
 pub struct Board {
     /// The port's path or name.
     pub port: String,
-    /// The board's serial number, if the system tells.
+    /// The board's serial number, if the system knows it.
     pub serial_number: Option<String>,
-    /// What the board calls itself, if the system tells.
+    /// What the board calls itself, if the system knows it.
     pub product: Option<String>,
 }
 
-/// Finds connected boards by their USB IDs. Where the system tells no IDs, it finds none.
+/// Finds connected boards by their USB IDs. Where the system knows no IDs, it finds none.
 pub fn list() -> Result<Vec<Board>, DeviceError> {
     let ports = serialport::available_ports()
         .map_err(|error| DeviceError::Open { address: "serial ports".to_owned(), source: error.into() })?;
@@ -38,7 +38,7 @@ pub fn list() -> Result<Vec<Board>, DeviceError> {
         .collect())
 }
 
-/// The port at which the board with a serial number is now, if the system tells.
+/// The port at which the board with a serial number is now, if the system knows it.
 pub fn port_of(serial_number: &str) -> Option<String> {
     let board =
         list().ok()?.into_iter().find(|board| board.serial_number.as_deref() == Some(serial_number))?;

@@ -1,11 +1,11 @@
 //! Several devices as one: their records in one order of time, on channels that are numbered on.
 //!
-//! Channel `c` of device `k`, both from 0, is channel `2k + c`, told from 1 as everywhere. The first device's clock is
+//! Channel `c` of device `k`, both from 0, is channel `2k + c`, numbered from 1 as everywhere. The first device's clock is
 //! everybody's: the others' records are put on it by the USB frames that all of them have marked
 //! ([`Follower`](super::clock::Follower)), and by each one's own UTC where they are not on one USB host controller.
 //!
 //! A record is handed out when none can come before it: each other device has sent a later one, is gone, or has had nothing to
-//! send for [`PATIENCE`] since. What comes later than that all the same keeps its true time.
+//! send for [`PATIENCE`] since. What comes even later keeps its true time.
 
 use std::borrow::Borrow;
 use std::collections::VecDeque;

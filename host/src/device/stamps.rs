@@ -6,7 +6,19 @@
 
 use cantap_wire::CHANNELS;
 
-use crate::{TraceEvent, TraceRecord};
+use super::clock::Ticks;
+use crate::TraceEvent;
+
+/// A record as it came from the device, by the device's own clock.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Stamped {
+    /// When.
+    pub at: Ticks,
+    /// Where: 1 or 2.
+    pub channel: u8,
+    /// What happened.
+    pub event: TraceEvent,
+}
 
 /// A bit's length on each channel, while it is open.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
@@ -36,18 +48,18 @@ impl BitLengths {
     }
 }
 
-/// Tightens records in stream order whose `time_ns` still holds device ticks. What stands behind a loss
-/// bounds what stands before it all the more.
-pub fn tighten(records: &mut [TraceRecord], lengths: &BitLengths) {
-    let mut limit = [i64::MAX; CHANNELS];
+/// Tightens records in stream order. What stands behind a loss bounds what stands before it all the more.
+pub fn tighten(records: &mut [Stamped], lengths: &BitLengths) {
+    let mut limits = [None; CHANNELS];
     for record in records.iter_mut().rev() {
         let TraceEvent::Frame { frame, .. } = &record.event else { continue };
         let channel = usize::from(record.channel == 2);
         if lengths.fixed[channel] == 0 {
             continue;
         }
-        record.time_ns = record.time_ns.min(limit[channel]);
-        limit[channel] = record.time_ns - lengths.ticks(channel, frame.bus_bits().total());
+        let limit = limits[channel].filter(|limit| record.at.since(*limit) > 0);
+        record.at = limit.unwrap_or(record.at);
+        limits[channel] = Some(record.at.plus(-lengths.ticks(channel, frame.bus_bits().total())));
     }
 }
 
@@ -56,13 +68,10 @@ mod tests {
     use super::*;
     use crate::Direction;
 
-    fn record(channel: u8, ticks: i64, late: bool) -> TraceRecord {
+    fn record(channel: u8, ticks: u64, late: bool) -> Stamped {
         let frame = "000#55".parse().unwrap();
-        TraceRecord {
-            time_ns: ticks,
-            channel,
-            event: TraceEvent::Frame { frame, direction: Direction::Rx, late },
-        }
+        let event = TraceEvent::Frame { frame, direction: Direction::Rx, late };
+        Stamped { at: Ticks(ticks), channel, event }
     }
 
     #[test]
@@ -78,7 +87,7 @@ mod tests {
             record(1, 10_600, false),
         ];
         tighten(&mut records, &lengths);
-        let times: Vec<i64> = records.iter().map(|record| record.time_ns).collect();
+        let times: Vec<u64> = records.iter().map(|record| record.at.0).collect();
         // Channel 2 has no known bit rate and stays.
         assert_eq!(times, [8512, 10_001, 9208, 9904, 10_600]);
     }
@@ -89,6 +98,6 @@ mod tests {
         lengths.set(0, 36, 36_000_000, 12_000_000);
         let mut records = vec![record(1, 1000, true), record(1, 9000, false)];
         tighten(&mut records, &lengths);
-        assert_eq!(records[0].time_ns, 1000);
+        assert_eq!(records[0].at, Ticks(1000));
     }
 }

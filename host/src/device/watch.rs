@@ -7,7 +7,7 @@ use std::time::Duration;
 
 /// How often the device's time is asked for.
 const ASK_EVERY: Duration = Duration::from_millis(500);
-/// A device that has answered nothing for so long is given up. With [`ASK_EVERY`] before it, that is within two seconds of
+/// A device that has answered nothing for this long is given up. With [`ASK_EVERY`] before it, that is within two seconds of
 /// its last answer.
 const PATIENCE: Duration = Duration::from_millis(1400);
 /// A pass takes as long as a read waits, about 50 ms. What is longer, the reader was not there.
@@ -20,7 +20,7 @@ pub(super) enum Next {
     Listen,
     /// Ask for the time.
     Ask,
-    /// Nothing has been answered for so long.
+    /// Nothing has been answered for this long.
     GiveUp(Duration),
 }
 

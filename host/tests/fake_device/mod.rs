@@ -1,4 +1,4 @@
-//! A hand-made device at the other end of a byte stream, which answers as a device does, or misbehaves as told.
+//! A hand-made device at the other end of a byte stream, which answers as a device does, or misbehaves as asked.
 
 use std::io::{ErrorKind, Read, Write};
 use std::sync::{Arc, Mutex};
@@ -205,7 +205,7 @@ impl FakeDevice {
         self.write(&out[..len]);
     }
 
-    /// Puts a received frame into the batch, so many ticks after the record before; the first counts from `base_ticks`.
+    /// Puts a received frame into the batch, this many ticks after the record before; the first counts from `base_ticks`.
     pub fn frame(&mut self, channel: Channel, frame: Frame, stamp: Stamp, ticks: i64, base_ticks: u64) {
         let received = Received { channel, frame, stamp, data_omitted: false };
         let mut record = [0; MAX_RECORD];

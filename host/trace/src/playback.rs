@@ -23,7 +23,7 @@ const SKIPPED_TO: Duration = Duration::from_secs(1);
 pub enum Due {
     /// This record is due.
     Record(TraceRecord),
-    /// Nothing is due for so long.
+    /// Nothing is due for this long.
     Wait(Duration),
     /// Paused: nothing is due before [`Playback::resume`], [`Playback::step`] or the like.
     Paused,

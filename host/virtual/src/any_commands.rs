@@ -50,11 +50,11 @@ enum Action {
     End(Box<Command>),
     Garbage(Vec<u8>),
     Line(Vec<u8>),
-    /// The program closes the port for so many milliseconds.
+    /// The program closes the port for this many milliseconds.
     Close(u8),
     Pass(u8),
     Read(bool),
-    /// The host reads nothing for so many milliseconds: at full load the queue overflows.
+    /// The host reads nothing for this many milliseconds: at full load the queue overflows.
     Stall(u16),
 }
 
@@ -147,7 +147,7 @@ struct Books {
     heard_before: [u64; CHANNELS],
     received: [u64; CHANNELS],
     lost: [u64; CHANNELS],
-    /// Frames that the device took for transmission, and those that it has told the end of.
+    /// Frames that the device took for transmission, and those whose end it has reported.
     taken: [usize; CHANNELS],
     ended: [usize; CHANNELS],
     /// Anything that a decoder in a session should not say.

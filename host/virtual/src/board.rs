@@ -272,7 +272,7 @@ pub struct VirtualPort {
     pub open: Arc<Dtr>,
     /// Packets that may still be sent now.
     credit: u32,
-    /// The host was told to wait.
+    /// The host was made to wait.
     held: bool,
 }
 

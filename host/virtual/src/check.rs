@@ -48,12 +48,12 @@ impl SequenceCheck {
         self.lost
     }
 
-    /// Whether each delivered frame was the one that had to come, each loss counted as so many.
+    /// Whether each delivered frame was the one that had to come, each loss counted as its number of frames.
     pub const fn in_order(&self) -> bool {
         self.in_order
     }
 
-    /// Whether the law holds for so many frames on the bus.
+    /// Whether the law holds for this many frames on the bus.
     pub const fn holds(&self, sent: u64) -> bool {
         self.in_order && self.exact && self.delivered + self.lost == sent
     }

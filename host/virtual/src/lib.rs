@@ -1,4 +1,4 @@
-//! A device without a board: the firmware's own logic, natively, on a simulated bus.
+#![doc = include_str!("../README.md")]
 //!
 //! It proves the logic and the host, in real time or as fast as possible. It does not prove interrupts,
 //! registers or USB: every interrupt is served at once, so stamps are exact and the controllers' FIFOs never
@@ -31,7 +31,3 @@ pub use options::{BadOption, Options, Pace};
 #[cfg(unix)]
 pub use pty::{Terminal, TerminalError, open_terminal};
 pub use runner::{Connection, VirtualDevice, open, start};
-
-#[cfg(doctest)]
-#[doc = include_str!("../README.md")]
-struct Readme;

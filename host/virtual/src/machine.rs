@@ -100,7 +100,7 @@ pub struct Machine<'q> {
     serial: String<24>,
     name: &'static str,
     crystal_ppm: f64,
-    /// What it told of earlier firmwares' controllers.
+    /// What it reported of earlier firmwares' controllers.
     heard_before: Heard,
     now_ns: u64,
     next_usb_ns: u64,

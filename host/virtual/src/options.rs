@@ -1,4 +1,4 @@
-//! What the virtual device is told after `virtual:`.
+//! What can be written after `virtual:`.
 
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
@@ -33,7 +33,7 @@ pub enum Pace {
 ///
 /// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `load` (per cent), `frames` (`std0` `std8` `ext0`
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
-/// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (so many of the frames that the device
+/// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (this many of the frames that the device
 /// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device
 /// saves), `serial` (the serial number that it tells), `ppm` (how much too fast its crystal is, in parts per million), `pace` (`real`, `fast`), `wire` (`apart`: a bus for each channel;
 /// `joined`: one bus for both), `channels` (`1`, `2` or `both`: those with traffic), and at the end `log=FILE` (a trace

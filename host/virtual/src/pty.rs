@@ -9,9 +9,8 @@ use std::time::Duration;
 
 use rustix::event::{PollFd, PollFlags, Timespec, poll};
 use rustix::fs::{Mode, OFlags};
-use rustix::io::FdFlags;
-use rustix::pty::OpenptFlags;
 use rustix::termios::{OptionalActions, QueueSelector};
+use rustix_openpty::{Pty, openpty};
 
 use super::board::Dtr;
 use super::options::Options;
@@ -127,7 +126,7 @@ impl Line {
         }
     }
 
-    /// Waits until the terminal is ready, or no program has it open, which is told as a hang-up.
+    /// Waits until the terminal is ready, or no program has it open, which shows as a hang-up.
     fn wait_for(&self, what: PollFlags, timeout: Duration) -> PollFlags {
         let mut fds = [PollFd::new(&self.terminal, what)];
         let timeout = Timespec { tv_sec: 0, tv_nsec: timeout.subsec_nanos().into() };
@@ -188,20 +187,15 @@ impl Line {
 /// A pseudo terminal in raw mode, and the path of its other end. That end was open and is closed, so that the system tells when
 /// a program opens it.
 fn new_terminal() -> io::Result<(OwnedFd, String)> {
-    let terminal = rustix::pty::openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY)?;
-    // A program that is started meanwhile would keep the port alive behind us.
-    rustix::io::fcntl_setfd(&terminal, FdFlags::CLOEXEC)?;
-    rustix::pty::grantpt(&terminal)?;
-    rustix::pty::unlockpt(&terminal)?;
-    let path = rustix::pty::ptsname(&terminal, Vec::new())?;
-    let path = path.into_string().map_err(|_| io::Error::other("its name is no text"))?;
-    let other = other_end(&path)?;
-    let mut settings = rustix::termios::tcgetattr(&other)?;
+    let Pty { controller, user } = openpty(None, None)?;
+    let mut settings = rustix::termios::tcgetattr(&user)?;
     settings.make_raw();
-    rustix::termios::tcsetattr(&other, OptionalActions::Now, &settings)?;
-    let flags = rustix::fs::fcntl_getfl(&terminal)?;
-    rustix::fs::fcntl_setfl(&terminal, flags | OFlags::NONBLOCK)?;
-    Ok((terminal, path))
+    rustix::termios::tcsetattr(&user, OptionalActions::Now, &settings)?;
+    let path = rustix::termios::ttyname(&user, Vec::new())?;
+    let path = path.into_string().map_err(|_| io::Error::other("its name is not text"))?;
+    let flags = rustix::fs::fcntl_getfl(&controller)?;
+    rustix::fs::fcntl_setfl(&controller, flags | OFlags::NONBLOCK)?;
+    Ok((controller, path))
 }
 
 fn other_end(path: &str) -> io::Result<OwnedFd> {

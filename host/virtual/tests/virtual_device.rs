@@ -472,7 +472,7 @@ fn a_crystal_that_is_off_shows_against_usb_frames() {
         assert!(Instant::now() < deadline, "{:?}", map.frames().trust(now));
         std::thread::sleep(Duration::from_millis(1));
     };
-    // A frame is a millisecond of the world, in which a crystal that is 80 ppm slow has so many ticks less.
+    // A frame is a millisecond of the world, in which a crystal that is 80 ppm slow has fewer ticks by this number.
     let (mut ticks, mut frames) = (Vec::new(), Vec::new());
     for (at, frame) in map.frames().marks() {
         ticks.push(at.0);

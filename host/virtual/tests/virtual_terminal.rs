@@ -10,7 +10,7 @@ use cantap::wire::{BitTiming, Channel, Command, Decoded, Decoder, PROTOCOL_VERSI
 use cantap_virtual::open_terminal;
 use serialport::{SerialPort, TTYPort};
 
-/// Nothing here takes so long, however busy the machine is.
+/// Nothing here takes this long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 fn open(path: &str) -> TTYPort {
@@ -28,7 +28,7 @@ fn hello(id: u16) -> Vec<u8> {
     [vec![0], request(id, Command::Hello { protocol: PROTOCOL_VERSION })].concat()
 }
 
-/// Numbers of the answers in order, until there are so many.
+/// Numbers of the answers in order, until there are this many.
 fn answers(port: &mut impl Read, decoder: &mut Decoder, count: usize) -> Vec<u16> {
     let mut ids = Vec::new();
     let started = Instant::now();

@@ -22,12 +22,12 @@ impl Clock {
         self.hz
     }
 
-    /// Cycles in so many microseconds.
+    /// Cycles in this many microseconds.
     pub const fn us(self, us: u64) -> u64 {
         us * (self.hz / 1_000_000)
     }
 
-    /// Cycles in so many milliseconds.
+    /// Cycles in this many milliseconds.
     pub const fn ms(self, ms: u64) -> u64 {
         self.us(1000 * ms)
     }

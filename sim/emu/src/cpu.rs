@@ -5,18 +5,21 @@
 //! By itself the core takes one cycle per instruction, one more per data access, two per taken branch, 12
 //! and 10 for exception entry and return; what it waits for beside is [`crate::timing`]'s.
 
+mod bus;
+mod memory;
 mod window;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use rsemu::core::space::{AddressSpace, DispatchPolicy, Mapping, MappingId, Perms, RamStore, Region};
+use rsemu::core::space::{AddressSpace, DispatchPolicy, Mapping, MappingId, Perms, Region};
 use rsemu::cpu::arm::v7m::sys::Exception;
 use rsemu::cpu::arm::v7m::{ArmV7m, Config, Regs, xpsr};
 
 use crate::memory_map as map;
-use crate::soc::rom;
-use crate::timing::{Bound, Delays, Speeds, Waits};
+use crate::timing::{Bound, Delays, Waits};
+pub use bus::Bus;
+pub use memory::{Memories, Memory};
 use window::{Shared, Window};
 
 /// A table of 64 KiB pages finds memories and peripherals faster than a search; the few above it are
@@ -29,16 +32,6 @@ const FRAME: u64 = 8;
 /// More than any tail-chained return takes in rsemu, at six cycles and one for each register that is popped; one that unstacks
 /// takes 19 and more.
 const TAIL_CHAIN: u64 = 18;
-
-/// Everything the core reaches that is not memory. The addresses are absolute.
-pub trait Bus: Send + Sync {
-    /// Reads 1, 2 or 4 bytes; `None` is a bus fault.
-    fn read(&self, address: u32, size: u8, now: u64) -> Option<u32>;
-    /// Writes 1, 2 or 4 bytes; `None` is a bus fault.
-    fn write(&self, address: u32, size: u8, value: u32, now: u64) -> Option<()>;
-    /// What the program has set up that times depend on.
-    fn speeds(&self) -> Speeds;
-}
 
 /// The processor's registers, as far as anything outside needs them.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -102,74 +95,6 @@ pub struct Cpu {
     space: Arc<AddressSpace>,
     /// What is mapped at address 0, and whether that is the bootloader.
     at_zero: (MappingId, bool),
-}
-
-/// A memory of the chip, shared with whoever must change it behind the core's back.
-#[derive(Clone, Debug)]
-pub struct Memory {
-    base: u32,
-    store: Arc<RamStore>,
-}
-
-impl Memory {
-    fn new(base: u32, len: u32) -> Self {
-        Self { base, store: Arc::new(RamStore::new(len.into())) }
-    }
-
-    /// Copies bytes out; false if the range is not within the memory.
-    pub fn read(&self, address: u32, into: &mut [u8]) -> bool {
-        self.offset(address).is_some_and(|offset| self.store.read_at(offset, into).is_ok())
-    }
-
-    /// Copies bytes in; false if the range is not within the memory.
-    pub fn write(&self, address: u32, bytes: &[u8]) -> bool {
-        self.offset(address).is_some_and(|offset| self.store.write_at(offset, bytes).is_ok())
-    }
-
-    /// The little-endian word at `address`, if that is within the memory.
-    pub fn word(&self, address: u32) -> Option<u32> {
-        let mut bytes = [0; 4];
-        self.read(address, &mut bytes).then(|| u32::from_le_bytes(bytes))
-    }
-
-    fn offset(&self, address: u32) -> Option<u64> {
-        Some(address.checked_sub(self.base)?.into())
-    }
-}
-
-/// The chip's memories, empty: flash reads as erased.
-#[derive(Clone, Debug)]
-pub struct Memories {
-    /// Flash at 0x0800_0000.
-    pub flash: Memory,
-    /// SRAM at 0x2000_0000.
-    pub sram: Memory,
-    /// Core-coupled memory at 0x1000_0000.
-    pub ccm: Memory,
-    /// The ROM bootloader at 0x1FFF_0000.
-    pub bootloader: Memory,
-}
-
-impl Memories {
-    /// All of an STM32F405's memory.
-    pub fn new() -> Self {
-        let flash = Memory::new(map::FLASH.start, map::FLASH.len() as u32);
-        flash.write(map::FLASH.start, &vec![0xFF; map::FLASH.len()]);
-        let bootloader = Memory::new(map::BOOTLOADER.start, map::BOOTLOADER.len() as u32);
-        bootloader.write(map::BOOTLOADER.start, &rom::contents());
-        Self {
-            flash,
-            sram: Memory::new(map::SRAM.start, map::SRAM.len() as u32),
-            ccm: Memory::new(map::CCM.start, map::CCM.len() as u32),
-            bootloader,
-        }
-    }
-}
-
-impl Default for Memories {
-    fn default() -> Self {
-        Self::new()
-    }
 }
 
 impl Cpu {

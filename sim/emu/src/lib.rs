@@ -1,6 +1,6 @@
-//! An STM32F405 or F407 that runs an unmodified program instruction by instruction, with two CAN buses and a USB host attached.
+#![doc = include_str!("../README.md")]
 //!
-//! It knows nothing of what the program is for. What it must be told is in [`Setup`]: the core's clock, the board's crystal, which
+//! It knows nothing of what the program is for. What it must know is in [`Setup`]: the core's clock, the board's crystal, which
 //! interrupts' masking is to be measured. Time is core cycles everywhere ([`Clock`]); nothing here looks at the host's clock, so the
 //! same inputs give the same run, byte for byte. How long the core waits for its memories is one of two bounds ([`timing`]).
 
@@ -17,6 +17,7 @@ pub mod otg;
 pub mod peripheral;
 pub mod probe;
 pub mod profile;
+pub mod rom;
 pub mod soc;
 pub mod stop;
 pub mod timing;

@@ -10,9 +10,9 @@ use crate::elf::Image;
 use crate::memory_map as map;
 use crate::probe::{Change, Probe};
 use crate::profile::Profile;
+use crate::rom::{self, Start};
 use crate::soc::rcc::{CRYSTAL_START_US, Crystal, ResetCause};
-use crate::soc::rom::{self, Start};
-use crate::soc::{Board, SharedBoard};
+use crate::soc::{Board, SharedBoard, bootloader};
 use crate::stop::{Reason, Stopped};
 use crate::timing::Bound;
 use crate::trace::Trace;
@@ -247,7 +247,7 @@ impl Machine {
         if !self.started {
             self.started = true;
             if self.setup.start == Start::Bootloader {
-                rom::leave(&mut lock(&self.board), &mut self.cpu);
+                bootloader::leave(&mut lock(&self.board), &mut self.cpu);
             }
         }
         self.refresh();

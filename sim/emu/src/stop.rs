@@ -1,4 +1,4 @@
-//! How a run ends before its time, told so that somebody can act on it.
+//! Why a run ended before its time, in words that somebody can act on.
 
 use std::fmt;
 

@@ -9,7 +9,7 @@ use cantap_wire::{CHANNELS, Command, Corruption, Decoded, Decoder, PROTOCOL_VERS
 pub enum Heard {
     /// A record at its device time in ticks.
     Record(u64, Record),
-    /// Batches are missing here, with so many frames of each channel.
+    /// Batches are missing here, with this many frames of each channel.
     BatchesLost([u32; CHANNELS]),
     /// The device has ended the session, at this device time.
     Ended(u64, EndReason),

@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use crate::board::{self, CLOCK};
 use cantap_wire::{CHANNELS, Frame};
 
+use super::error::Error;
 use super::exported::Exported;
-use super::server::Error;
 use super::urbs::Urbs;
 use crate::rig::MS;
 use crate::run::DEFAULT_BITRATE_BPS;
@@ -30,7 +30,7 @@ const SEEDS: u64 = 10;
 
 /// What is on the buses of open channels.
 #[derive(Clone, Copy, Debug)]
-pub struct Load {
+pub struct BusLoad {
     /// Share of the bus, 0 to 100.
     pub percent: f64,
     /// Which frames.
@@ -76,7 +76,7 @@ pub struct Figures {
 pub struct Board {
     machine: Machine,
     port: Arc<Mutex<UsbPort<Urbs>>>,
-    load: Load,
+    load: BusLoad,
     seed: u64,
     /// Cycles of a bit of each channel that is open.
     open: [Option<u64>; CHANNELS],
@@ -113,7 +113,7 @@ impl Board {
         Self {
             machine,
             port,
-            load: Load { percent: 0.0, kind: Kind::Mix, bitrate_bps: None },
+            load: BusLoad { percent: 0.0, kind: Kind::Mix, bitrate_bps: None },
             seed: 1,
             open: [None; CHANNELS],
             openings: [0; CHANNELS],
@@ -154,7 +154,7 @@ impl Board {
         Ok(())
     }
 
-    /// Time stood still for so long.
+    /// Time stood still for this long.
     pub fn starved(&mut self, time: Duration) {
         self.starving += time;
     }
@@ -184,7 +184,7 @@ impl Board {
             }
             self.open[n] = bit;
             self.openings[n] += u64::from(bit.is_some());
-            let Load { percent, kind, bitrate_bps } = self.load;
+            let BusLoad { percent, kind, bitrate_bps } = self.load;
             let time = match (bitrate_bps, bit) {
                 (None, Some(cycles)) => BitTime::of_cycles(cycles),
                 (rate, _) => BitTime::of_rate(rate.unwrap_or(DEFAULT_BITRATE_BPS), CLOCK),
@@ -197,13 +197,13 @@ impl Board {
     }
 
     /// Traffic for channels that are opened from now on.
-    pub fn set_load(&mut self, load: Load) {
+    pub fn set_load(&mut self, load: BusLoad) {
         self.load = load;
         self.seed += SEEDS;
     }
 
-    /// Puts so many frames on an open channel's bus, from now on, in place of its traffic.
-    pub fn play(&mut self, n: usize, load: Load, count: u64) {
+    /// Puts this many frames on an open channel's bus, from now on, in place of its traffic.
+    pub fn play(&mut self, n: usize, load: BusLoad, count: u64) {
         self.seed += SEEDS;
         let traffic = Traffic::new(load.kind, self.seed, load.percent, self.machine.now(), u64::MAX);
         let time = self.open[n].map_or(BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK), BitTime::of_cycles);

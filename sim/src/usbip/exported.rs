@@ -1,6 +1,6 @@
-//! What the server tells of its device before a kernel has seen it: a record made of the device's own descriptors.
+//! What the server says of its device before a kernel has seen it: a record made of the device's own descriptors.
 
-use super::server::Error;
+use super::error::Error;
 
 /// The bus ID that a kernel asks for.
 pub const BUS_ID: &str = "1-1";
@@ -32,7 +32,7 @@ pub struct Endpoint {
     pub interval: u8,
 }
 
-/// The device, as its descriptors tell it.
+/// The device, as its descriptors describe it.
 #[derive(Clone, Debug)]
 pub struct Exported {
     device: Vec<u8>,

@@ -88,7 +88,7 @@ pub enum Action {
     Reset,
 }
 
-/// What a transfer was asked for as; its end is told alike.
+/// How a transfer was asked for; its end is reported in the same way.
 #[derive(Clone, Copy, Debug)]
 enum Asked {
     Control([u8; 10]),

@@ -7,7 +7,7 @@ use std::path::Path;
 use cantap_wire::{CHANNELS, Frame};
 use serde_json::json;
 
-use super::board::{Board, Load};
+use super::board::{Board, BusLoad};
 use crate::CYCLES_PER_SECOND;
 use cantap_emu::traffic::Kind;
 use cantap_emu::usb_host::Request;
@@ -88,8 +88,8 @@ fn number<T: std::str::FromStr>(text: &str) -> Result<T, String> {
     text.parse().map_err(|_| format!("not a number: {text}"))
 }
 
-fn load(percent: &str, kind: &str, bitrate_bps: Option<u32>) -> Result<Load, String> {
-    Ok(Load { percent: number(percent)?, kind: kind.parse::<Kind>()?, bitrate_bps })
+fn load(percent: &str, kind: &str, bitrate_bps: Option<u32>) -> Result<BusLoad, String> {
+    Ok(BusLoad { percent: number(percent)?, kind: kind.parse::<Kind>()?, bitrate_bps })
 }
 
 fn index(channel: &str) -> Result<usize, String> {

@@ -9,6 +9,7 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use super::board::Board;
+use super::error::Error;
 use super::exported::{BUS_ID, Exported};
 use super::protocol::{self, Message, Opening};
 use super::redir::{Action, Packet, Redir};
@@ -16,41 +17,18 @@ use super::script::{self, Wish};
 use super::urbs::{Urb, Urbs};
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::elf::Image;
-use cantap_emu::stop::Stopped;
 
-/// So long the machine runs before the sockets are looked at.
+/// How long the machine runs between two looks at the sockets.
 const SLICE: u64 = 100 * CYCLES_PER_US;
 const SLICE_WALL: Duration = Duration::from_nanos(SLICE * 1_000_000_000 / CYCLES_PER_SECOND);
-/// So long to wait for a kernel that owes reads before it is looked at again.
+/// How long to wait for a kernel that owes reads before looking again.
 const STARVED_WAIT: Duration = Duration::from_millis(20);
 /// Emulated time ahead of the wall's clock by less is not worth a wait.
 const LEAST_WAIT: Duration = Duration::from_millis(1);
-/// So far the emulation may lag behind the wall's clock before it gives the difference up.
+/// How far the emulation may lag behind the wall's clock before it gives the difference up.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
 /// Linux' ECONNRESET: a transfer was taken back.
 const ECONNRESET: i32 = -104;
-
-/// Why serving ended.
-#[derive(Debug, thiserror::Error)]
-pub enum Error {
-    /// The firmware ended.
-    #[error("{0}")]
-    Stopped(#[from] Stopped),
-    /// A socket, or the folder.
-    #[error("{0}")]
-    Io(#[from] io::Error),
-    /// Nothing came up on the port.
-    #[error("the device does not show its descriptors")]
-    NoDevice,
-    /// What came up is not a device.
-    #[error("descriptors of {device} and {configuration} bytes")]
-    Descriptors {
-        /// Bytes of the device descriptor.
-        device: usize,
-        /// Bytes of the configuration.
-        configuration: usize,
-    },
-}
 
 enum Event {
     Import(TcpStream, u64),
@@ -71,7 +49,7 @@ enum Event {
 struct Kernel {
     connection: u64,
     stream: TcpStream,
-    /// How QEMU is told; without, it is USB/IP.
+    /// What QEMU is answered in; without, it is USB/IP.
     redir: Option<Redir>,
 }
 

@@ -28,7 +28,7 @@ const SET_CONTROL_LINE_STATE: (u8, u8) = (0x21, 0x22);
 const DEVICE_DESCRIPTOR: u16 = 0x0100;
 /// What Linux asks for first, before it knows the size of endpoint 0's packets.
 const FIRST_LOOK_BYTES: u16 = 64;
-/// Endpoint 0's packets, as long as the device has not told their size.
+/// Endpoint 0's packets, until the device has said how large they are.
 const LARGEST_PACKET: usize = 64;
 /// What a device has to take its address (USB 2.0, 9.2.6.3).
 const ADDRESS_PAUSE_MS: u64 = 2;

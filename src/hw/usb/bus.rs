@@ -38,7 +38,7 @@ pub struct Core {
     configured: bool,
     /// The host has the port open, and has not configured the device anew since.
     dtr: bool,
-    /// As usb-device has been told.
+    /// As usb-device knows it.
     suspended: bool,
 }
 
@@ -71,7 +71,7 @@ impl Core {
         registers.modify(DCTL, 0, dctl::SDIS);
         registers.modify(DCFG, 0, dcfg::DSPD_FULL);
         registers.write(DIEPMSK, epint::XFRC);
-        // What comes is told by the receive FIFO's status.
+        // The receive FIFO's status says what comes.
         registers.write(DOEPMSK, 0);
         registers.write(DAINTMSK, 1 | 1 << BULK_IN);
         registers.write(GINTSTS, !0);
@@ -152,7 +152,7 @@ impl Core {
     fn poll(&mut self) -> PollResult {
         let flags = self.registers.read(GINTSTS);
         if flags & gint::USBRST != 0 {
-            // Of the silence before a reset nobody needs to hear any more.
+            // The silence before a reset is of no interest any more.
             self.registers.write(GINTSTS, gint::USBRST | gint::USBSUSP | gint::WKUPINT);
             return PollResult::Reset;
         }

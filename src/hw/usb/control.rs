@@ -79,7 +79,7 @@ impl Control {
         (self.setup_waits, self.packet_waits)
     }
 
-    /// Takes what waits. A packet for which there is no room is gone all the same.
+    /// Takes what waits. A packet for which there is no room is lost.
     pub fn read(&mut self, registers: &mut Registers, out: &mut [u8]) -> Result<usize> {
         let bytes = if core::mem::take(&mut self.setup_waits) {
             &self.setup[..]

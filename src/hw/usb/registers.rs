@@ -153,7 +153,7 @@ impl Endpoint {
     }
 }
 
-/// A flag of the controller follows within a few clocks of USB; so many reads are more than that, and the end of waiting for
+/// A flag of the controller follows within a few clocks of USB; this many reads are more than that, and the end of waiting for
 /// hardware that does not answer.
 const MOST_READS: u32 = 1_000;
 

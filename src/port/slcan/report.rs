@@ -1,7 +1,7 @@
 //! Losses, errors and states as lines of their own, where a host asks for them (`K1`): those that Linux' slcan driver
 //! understands from 6.0 on (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details -statistics link`.
 //!
-//! `e`, a digit and so many letters are errors; each line counts once, however often it names one. The driver ignores lines
+//! `e`, a digit and this many letters are errors; each line counts once, however often it names one. The driver ignores lines
 //! shorter than five characters, so an error is named three times. `s`, a letter and two counters of three decimal digits, receive
 //! and transmit, are a new state.
 

@@ -41,7 +41,7 @@ pub struct ChannelStatus {
     pub last_error: Option<BusErrorKind>,
     /// Frames taken from the controller, those that the queue lost included.
     pub frames: u32,
-    /// Times the controller's FIFO overran: at least so many frames were lost.
+    /// Times the controller's FIFO overran: at least this many frames were lost.
     pub lost_controller: u32,
     /// Frames lost because the queue was full.
     pub lost_queue: u32,

@@ -1,4 +1,4 @@
-//! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` tells.
+//! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
     ChannelConfig, ChannelStatus, Checksum, Defaults, Failures, Filter, FrameKind, Modifier, Periodic,

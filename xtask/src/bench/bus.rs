@@ -14,7 +14,7 @@ use cantap_sim::stream::{self, Filled, Replayed};
 use cantap_wire::Channel;
 use cantap_wire::Channel::{Can1, Can2};
 
-use super::Extent;
+use super::extent::Extent;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;

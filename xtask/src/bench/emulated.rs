@@ -15,7 +15,7 @@ use cantap_sim::rig::{MS, Rig};
 use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::Channel;
 
-use super::Extent;
+use super::extent::Extent;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;

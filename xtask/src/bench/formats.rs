@@ -65,7 +65,7 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// The recording over and over, with times that go on, up to so many frames.
+/// The recording over and over, with times that go on, up to this many frames.
 pub(super) fn make_trace(log: &Path, frames: u64) -> Result<()> {
     let records: Vec<_> =
         open_reader(workspace::root().join(RECORDING), &ReadOptions::default())?.collect::<Result<_, _>>()?;

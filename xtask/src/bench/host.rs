@@ -13,7 +13,7 @@ use super::wire::{KINDS, encode};
 
 /// Frames of each kind: a stream that does not fit a cache.
 const FRAMES: u64 = 2_000_000;
-/// Each measurement is the best of so many, for the machine may be busy with something else.
+/// Each measurement is the best of this many, for the machine may be busy with something else.
 const ROUNDS: usize = 5;
 /// What the design asks for, in million frames per second.
 const WANTED_MILLIONS: f64 = 10.0;

@@ -10,6 +10,8 @@ mod clock;
 #[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
+mod extent;
+#[cfg(feature = "bench")]
 mod formats;
 #[cfg(feature = "bench")]
 mod host;
@@ -89,32 +91,12 @@ pub fn run(args: &Args) -> Result<()> {
     Ok(())
 }
 
-/// How much of what the emulated board can be asked is measured.
-#[cfg(feature = "bench")]
-struct Extent<'a> {
-    rows: &'a str,
-    quick: bool,
-}
-
-#[cfg(feature = "bench")]
-impl Extent<'_> {
-    /// Whether the row of this name is wanted.
-    fn wants(&self, row: &str) -> bool {
-        row.contains(self.rows)
-    }
-
-    /// A time, or what is left of it if it must be quick.
-    fn shortened(&self, time: u64) -> u64 {
-        if self.quick { time / 10 } else { time }
-    }
-}
-
 /// Measures.
 #[cfg(feature = "bench")]
 pub fn run(args: &Args) -> Result<()> {
     use clap::ValueEnum;
 
-    let extent = Extent { rows: &args.rows, quick: args.quick };
+    let extent = extent::Extent { rows: &args.rows, quick: args.quick };
     let subjects = if args.subject.is_empty() { Subject::value_variants() } else { &args.subject };
     for subject in subjects {
         match subject {

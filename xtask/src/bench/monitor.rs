@@ -5,7 +5,7 @@ use xshell::cmd;
 
 use crate::workspace;
 
-/// Runs it for so long.
+/// Runs it for this long.
 pub fn run(seconds: u32) -> Result<()> {
     let shell = workspace::shell()?;
     ensure!(

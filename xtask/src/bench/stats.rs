@@ -8,7 +8,7 @@ use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
 
 /// Frames in one round.
 const FRAMES: usize = 1 << 20;
-/// The best of so many rounds counts.
+/// The best of this many rounds counts.
 const ROUNDS: usize = 5;
 /// What the design asks for, in frames/s.
 const AT_LEAST: f64 = 5e6;

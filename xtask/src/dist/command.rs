@@ -5,7 +5,8 @@ use std::path::{Path, PathBuf};
 use anyhow::Result;
 use xshell::{Shell, cmd};
 
-use super::{VERSION, archive, notices, staging};
+use super::archive::{VERSION, archive, staging};
+use super::notices;
 use crate::workspace;
 
 /// Shells, and what each calls the file with a command's completions.

@@ -7,7 +7,8 @@ use std::path::Path;
 use anyhow::{Context, Result, ensure};
 use xshell::{Shell, cmd};
 
-use super::{VERSION, command, notices, staging};
+use super::archive::{VERSION, staging};
+use super::{command, notices};
 use crate::toolchain::is_installed;
 
 /// Completions, by shell: where Debian looks for them.

@@ -7,7 +7,8 @@ use object::read::elf::{ElfFile32, FileHeader, ProgramHeader};
 use object::{Endianness, elf};
 use xshell::Shell;
 
-use super::{VERSION, archive, notices, staging};
+use super::archive::{VERSION, archive, staging};
+use super::notices;
 use crate::board::Board;
 use crate::firmware::build_all;
 use crate::toolchain::{TARGET, Toolchain};

@@ -37,7 +37,7 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// Counts an interval of so many nanoseconds.
+    /// Counts an interval of this many nanoseconds.
     pub fn add(&mut self, interval_ns: i64) {
         *self.counts.entry(interval_ns.div_euclid(self.bin_ns)).or_default() += 1;
         self.total += 1;

@@ -338,7 +338,7 @@ fn lay_out_axis(plot: &Plot, top: f32, scene: &mut Scene) {
     }
 }
 
-/// The text, cut where it would not fit so many units.
+/// The text, cut where it would not fit this many units.
 fn fitting(text: &str, width: f32, size: f32) -> String {
     let most = (width / (size * 0.62)) as usize;
     if text.chars().count() <= most {

@@ -1,4 +1,4 @@
-//! A curve's points, of which a picture needs only so many: memory does not grow with the trace.
+//! A curve's points, of which a picture needs only a limited number: memory does not grow with the trace.
 
 /// Points that a [`Series`] keeps at most.
 pub const MOST_POINTS: usize = 32_768;

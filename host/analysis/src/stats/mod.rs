@@ -231,12 +231,6 @@ impl Statistics {
     pub fn last_ns(&self) -> Option<i64> {
         (!self.channels.is_empty()).then_some(self.last_ns)
     }
-
-    /// Everything as plain values, ready to be printed or serialised. [`Self::finish`] comes first
-    /// where the trace is over.
-    pub fn summary(&self) -> Summary {
-        Summary::of(self)
-    }
 }
 
 #[cfg(test)]

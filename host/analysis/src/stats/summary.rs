@@ -213,8 +213,16 @@ fn seconds(ns: i64) -> f64 {
     (ns / 1_000_000_000) as f64 + (ns % 1_000_000_000) as f64 / 1e9
 }
 
+impl Statistics {
+    /// Everything as plain values, ready to be printed or serialised. [`Self::finish`] comes first
+    /// where the trace is over.
+    pub fn summary(&self) -> Summary {
+        Summary::of(self)
+    }
+}
+
 impl Summary {
-    pub(super) fn of(statistics: &Statistics) -> Self {
+    fn of(statistics: &Statistics) -> Self {
         let mut channels: Vec<_> = statistics
             .channels()
             .iter()

@@ -25,7 +25,7 @@ impl WorkLoad {
         }
     }
 
-    /// Takes a frame that ended at `end_ns` and takes so many bit times on the bus, intermission included: bits at the nominal rate,
+    /// Takes a frame that ended at `end_ns` and takes this many bit times on the bus, intermission included: bits at the nominal rate,
     /// and those of an FD frame's data phase by how many of the nominal rate last as long.
     #[inline]
     pub fn frame(&mut self, end_ns: i64, bit_times: f64) {

@@ -13,6 +13,7 @@ use super::super::issue::Fault;
 use super::super::sja1000;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
+use super::content::{Content, OnChannel};
 use super::{FD_FORMAT, REMOTE, STATES, others};
 use cantap_trace::fd::{FD_LENGTHS, FD_MAX_BYTES};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
@@ -31,36 +32,6 @@ pub(crate) struct Decoder {
     base_ns: Option<i64>,
     /// Of the dates.
     zone: Zone,
-}
-
-/// What a line is.
-pub(super) enum Content {
-    Record(TraceRecord),
-    /// A request to send: if it gets through, a Tx line follows.
-    Request,
-    /// A known thing that is no part of a trace of CAN, by kind.
-    LeftOut(&'static str),
-    /// Part of the file's frame, which nobody misses.
-    Other,
-}
-
-/// What a line on a channel of CAN is.
-pub(super) enum OnChannel {
-    Event(TraceEvent),
-    /// A request to send: if it gets through, a Tx line follows.
-    Request,
-    /// A known thing that is no part of a trace, by kind.
-    LeftOut(&'static str),
-}
-
-impl OnChannel {
-    fn on(self, time_ns: i64, channel: u8) -> Content {
-        match self {
-            Self::Event(event) => Content::Record(TraceRecord { time_ns, channel, event }),
-            Self::Request => Content::Request,
-            Self::LeftOut(what) => Content::LeftOut(what),
-        }
-    }
 }
 
 /// Whether `line` begins with `word`, in any case.

@@ -3,7 +3,7 @@
 
 use super::super::issue::Fault;
 use super::super::text;
-use super::decode::{Content, OnChannel};
+use super::content::{Content, OnChannel};
 
 /// Events by the word behind their time.
 const KINDS: [(&[&str], &str); 11] = [

@@ -11,7 +11,7 @@ use super::common::{CommonClock, NotCommon};
 use super::units::UtcNs;
 use super::{ClockMap, FrameDoubt};
 
-/// Times are moved no faster than this: an interval is told to a two-thousandth, and the two devices' own maps, which may each
+/// Times are moved no faster than this: an interval is right to a two-thousandth, and the two devices' own maps, which may each
 /// move by 100 ppm while they settle, are overtaken.
 const MAX_PACE: f64 = 500e-6;
 

@@ -34,9 +34,9 @@ const JITTER_NS: f64 = 5_000.0;
 const UNKNOWN_RATE: f64 = 1e-3;
 /// How far a rate may have moved, once it is known.
 const KNOWN_RATE: f64 = 10e-6;
-/// No mark for so long: the next frame numbers may begin anywhere.
+/// No mark for this long: the next frame numbers may begin anywhere.
 const SILENCE_NS: f64 = 3e9;
-/// After so long, nothing is held to what was before: by then any frame number would do.
+/// After this long, nothing is held to what was before: by then any frame number would do.
 const FORGET_NS: f64 = 30e9;
 
 /// A device's word on when a frame started.

@@ -25,7 +25,7 @@ struct Simulated {
     warm_up_ppm: f64,
     /// How much too fast the controller's frames are.
     frames_ppm: f64,
-    /// Frame 0 of the controller started so long after the start.
+    /// Frame 0 of the controller started this long after the start.
     frames_from_ns: i64,
     /// A SOF is early or late by up to this.
     jitter_ns: f64,
@@ -35,7 +35,7 @@ const EXACT: Simulated =
     Simulated { ppm: 0.0, warm_up_ppm: 0.0, frames_ppm: 0.0, frames_from_ns: 300_123, jitter_ns: 0.0 };
 
 impl Simulated {
-    /// Its timer, so long after the start.
+    /// Its timer, this long after the start.
     fn ticks(&self, ns: i64) -> Ticks {
         const MINUTE_S: f64 = 60.0;
         let seconds = ns as f64 / 1e9;
@@ -62,7 +62,7 @@ impl Simulated {
     }
 }
 
-/// A map of a device, asked once a second for so many seconds; questions and answers take as long as `delays` says for each
+/// A map of a device, asked once a second for this many seconds; questions and answers take as long as `delays` says for each
 /// second. `marks` says what becomes of each second's mark. With the worst error in microseconds after the first minute, and whether time ran backwards.
 fn follow(
     device: &Simulated,

@@ -2,7 +2,7 @@
 
 use std::time::{Instant, SystemTime, UNIX_EPOCH};
 
-/// Time by a device's stamp timer: ticks since it started, of which `Hello` tells the rate.
+/// Time by a device's stamp timer: ticks since it started, at the rate that `Hello` gives.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct Ticks(pub u64);
 
@@ -12,7 +12,7 @@ impl Ticks {
         self.0.wrapping_sub(other.0) as i64
     }
 
-    /// This time, and so many ticks.
+    /// This time, and this many ticks.
     #[must_use]
     pub const fn plus(self, ticks: i64) -> Self {
         Self(self.0.wrapping_add_signed(ticks))
@@ -29,7 +29,7 @@ impl UtcNs {
         self.0 - other.0
     }
 
-    /// This time, and so many nanoseconds.
+    /// This time, and this many nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
         Self(self.0 + ns)
@@ -48,7 +48,7 @@ impl FrameNs {
         self.0 - other.0
     }
 
-    /// This time, and so many nanoseconds.
+    /// This time, and this many nanoseconds.
     #[must_use]
     pub const fn plus(self, ns: i64) -> Self {
         Self(self.0 + ns)

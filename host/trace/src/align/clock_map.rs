@@ -8,7 +8,7 @@ use super::sketch::Pair;
 const PIECE_NS: i64 = 1_000_000_000;
 /// Moments in a piece.
 const PIECE_PAIRS: usize = 32;
-/// Moments further from a piece's line than so many times the typical distance are left out of it.
+/// Moments further from a piece's line than this many times the typical distance are left out of it.
 const OUTLIER: f64 = 4.0;
 /// Rounds of leaving out.
 const ROUNDS: usize = 3;

@@ -48,7 +48,7 @@ pub(super) struct Pair {
 }
 
 impl Sketch {
-    /// A sketch of runs of so many frames: longer ones are told apart better, shorter ones survive more losses.
+    /// A sketch of runs of this many frames: longer ones are told apart better, shorter ones survive more losses.
     pub fn new(length: usize) -> Self {
         Self {
             length: length.max(1),

@@ -4,9 +4,9 @@ use std::collections::VecDeque;
 
 use cantap_wire::{Frame, Id};
 
-/// Longest request that is taken, in bytes. Longer ones are told that there is no room.
+/// Longest request that is taken, in bytes. Longer ones are answered that there is no room.
 const MAX_REQUEST: usize = 512;
-/// The other side's silence ends a transfer after so long (N_Bs, N_Cr).
+/// The other side's silence ends a transfer after this long (N_Bs, N_Cr).
 const PATIENCE_NS: u64 = 1_000_000_000;
 /// An ECU takes this time to answer.
 const THINKS_NS: u64 = 4_000_000;

@@ -14,7 +14,7 @@ use crate::simbus::{Node, Schedule, SimBus, Traffic};
 
 const SECOND_NS: u64 = 1_000 * MS_NS;
 
-/// Listens, and sends what it is told.
+/// Listens, and sends what it is given.
 struct Analyser {
     bitrate_bps: u32,
     now_ns: u64,

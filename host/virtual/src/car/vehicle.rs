@@ -8,7 +8,7 @@ use std::f64::consts::PI;
 const DT: f64 = 0.01;
 /// The same in nanoseconds.
 pub const STEP_NS: u64 = 10_000_000;
-/// The drive repeats after so many seconds.
+/// The drive repeats after this many seconds.
 pub const CYCLE_S: f64 = 120.0;
 /// Where the drive cycle's speed has corners: seconds, km/h.
 const DRIVE: [(f64, f64); 14] = [
@@ -38,9 +38,9 @@ const STEERING_RATIO: f64 = 16.0;
 const GRAVITY: f64 = 9.81;
 /// Gear ratios, the final drive included.
 const RATIOS: [f64; 6] = [14.0, 8.2, 5.5, 3.9, 3.1, 2.53];
-/// Above so many km/h the next gear is taken.
+/// Above this many km/h the next gear is taken.
 const SHIFT_UP_KMH: [f64; 5] = [18.0, 34.0, 50.0, 68.0, 86.0];
-/// Below so many km/h less than that the gear is left again.
+/// Below this many km/h less than that the gear is left again.
 const SHIFT_HYSTERESIS_KMH: f64 = 5.0;
 const SHIFT_S: f64 = 0.35;
 /// Cranking, after the ignition is switched on.

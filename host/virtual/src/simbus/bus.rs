@@ -85,7 +85,7 @@ impl SimBus {
         Self { error_percent, ..self }
     }
 
-    /// Destroys the first frames of the controllers that are given to each call, each time that they send one: so many bit
+    /// Destroys the first frames of the controllers that are given to each call, each time that they send one: this many bit
     /// errors. 32 in a row make a controller bus-off.
     #[must_use]
     pub fn disturbing(self, frames: u32) -> Self {

@@ -17,7 +17,7 @@ use cantap_can::BusErrorKind;
 use cantap_can::Frame;
 use fastrand::Rng;
 
-use crate::can::fault::Counters;
+use crate::can::fault::ErrorCounters;
 use crate::can::{CanPair, Mode};
 pub use node::{BitTime, Node, Source};
 use outcome::Detection;
@@ -313,7 +313,7 @@ impl Wire {
                     node.counters.receive_error(seen.first);
                 }
                 if node.counters.bus_off() {
-                    node.counters = Counters::default();
+                    node.counters = ErrorCounters::default();
                     node.not_before = self.now + recovery;
                 }
             }

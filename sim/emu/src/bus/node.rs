@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use cantap_can::Frame;
 
 use crate::Clock;
-use crate::can::fault::Counters;
+use crate::can::fault::ErrorCounters;
 
 /// Where a node's frames come from when its own queue is empty.
 pub trait Source: Send {
@@ -54,7 +54,7 @@ impl BitTime {
 pub struct Node {
     pub(super) bit: BitTime,
     pub(super) acknowledges: bool,
-    pub(super) counters: Counters,
+    pub(super) counters: ErrorCounters,
     /// Nothing is sent before this cycle: bus-off, or the pause of an error-passive sender.
     pub(super) not_before: u64,
     queue: VecDeque<(u64, Frame)>,
@@ -68,7 +68,7 @@ impl Node {
         Self {
             bit,
             acknowledges: true,
-            counters: Counters::default(),
+            counters: ErrorCounters::default(),
             not_before: 0,
             queue: VecDeque::new(),
             source: None,
@@ -118,7 +118,7 @@ impl Node {
     }
 
     /// Its error counters.
-    pub fn counters(&self) -> Counters {
+    pub fn counters(&self) -> ErrorCounters {
         self.counters
     }
 

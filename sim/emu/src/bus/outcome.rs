@@ -57,7 +57,7 @@ pub struct Detection {
 
 /// How a frame ends.
 #[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Outcome {
+pub struct FrameEnd {
     /// Every error, as each node sees it. A receiver that is not among them takes the frame.
     pub detections: Vec<Detection>,
     /// Who acknowledged.
@@ -68,7 +68,7 @@ pub struct Outcome {
     pub free_after: usize,
 }
 
-impl Outcome {
+impl FrameEnd {
     /// Works out how a frame ends for these participants.
     pub fn of(bits: &FrameBits, participants: &[Participant], disturbance: Option<Disturbance>) -> Self {
         let mut seen: Vec<Option<(usize, BusErrorKind)>> = participants.iter().map(|p| p.own).collect();
@@ -197,13 +197,13 @@ mod tests {
         FrameBits::new(&"123#1122".parse().unwrap())
     }
 
-    fn kinds(outcome: &Outcome) -> Vec<(usize, BusErrorKind)> {
+    fn kinds(outcome: &FrameEnd) -> Vec<(usize, BusErrorKind)> {
         outcome.detections.iter().map(|detection| (detection.who, detection.kind)).collect()
     }
 
     #[test]
     fn a_good_frame_has_no_error_and_three_bits_of_intermission() {
-        let outcome = Outcome::of(&bits(), &[SENDER, RECEIVER, LISTENER], None);
+        let outcome = FrameEnd::of(&bits(), &[SENDER, RECEIVER, LISTENER], None);
         assert_eq!(outcome.detections, []);
         assert_eq!(outcome.acknowledged_by, [1]);
         assert_eq!(outcome.free_after, bits().len() + 3);
@@ -213,7 +213,7 @@ mod tests {
     /// listener sees as a form error.
     #[test]
     fn nobody_acknowledges_for_a_listener() {
-        let outcome = Outcome::of(&bits(), &[SENDER, LISTENER], None);
+        let outcome = FrameEnd::of(&bits(), &[SENDER, LISTENER], None);
         assert_eq!(kinds(&outcome), [(0, BusErrorKind::Acknowledgment), (1, BusErrorKind::Form)]);
         assert_eq!(outcome.free_after, bits().ack_slot() + 1 + 6 + 8 + 3);
     }
@@ -222,14 +222,14 @@ mod tests {
     #[test]
     fn a_passive_lone_sender_is_heard_by_a_listener() {
         let passive = Participant { flags: false, ..SENDER };
-        let outcome = Outcome::of(&bits(), &[passive, LISTENER], None);
+        let outcome = FrameEnd::of(&bits(), &[passive, LISTENER], None);
         assert_eq!(kinds(&outcome), [(0, BusErrorKind::Acknowledgment)]);
     }
 
     #[test]
     fn an_error_that_only_a_listener_sees_harms_nobody() {
         let confused = Participant { own: Some((20, BusErrorKind::Stuff)), ..LISTENER };
-        let outcome = Outcome::of(&bits(), &[SENDER, RECEIVER, confused], None);
+        let outcome = FrameEnd::of(&bits(), &[SENDER, RECEIVER, confused], None);
         assert_eq!(kinds(&outcome), [(2, BusErrorKind::Stuff)]);
         assert_eq!(outcome.free_after, bits().len() + 3);
     }
@@ -237,7 +237,7 @@ mod tests {
     #[test]
     fn an_error_that_a_receiver_sees_destroys_the_frame_for_all() {
         let confused = Participant { own: Some((20, BusErrorKind::Stuff)), ..RECEIVER };
-        let outcome = Outcome::of(&bits(), &[SENDER, RECEIVER, confused], None);
+        let outcome = FrameEnd::of(&bits(), &[SENDER, RECEIVER, confused], None);
         assert_eq!(outcome.detections.len(), 3);
         assert!(outcome.detections[2].first && !outcome.detections[1].first);
         assert_eq!(outcome.acknowledged_by, [] as [usize; 0]);
@@ -252,7 +252,7 @@ mod tests {
             (Disturbance::Form, Acknowledgment, Form),
             (Disturbance::Ack, Acknowledgment, Form),
         ] {
-            let outcome = Outcome::of(&bits(), &[SENDER, RECEIVER], Some(disturbance));
+            let outcome = FrameEnd::of(&bits(), &[SENDER, RECEIVER], Some(disturbance));
             assert_eq!(kinds(&outcome)[0].1, sender, "{disturbance:?}");
             if disturbance == Disturbance::Crc {
                 // The sender's flag for the missing ACK hides the CRC error from the only receiver.
@@ -266,7 +266,7 @@ mod tests {
 
     #[test]
     fn a_bit_error_is_seen_by_the_sender_first() {
-        let outcome = Outcome::of(&bits(), &[SENDER, RECEIVER], Some(Disturbance::Bit { index: 30 }));
+        let outcome = FrameEnd::of(&bits(), &[SENDER, RECEIVER], Some(Disturbance::Bit { index: 30 }));
         assert_eq!(outcome.detections[0].bit, 30);
         let expected =
             if bits().levels()[30] { BusErrorKind::BitRecessive } else { BusErrorKind::BitDominant };

@@ -5,7 +5,7 @@
 use cantap_can::BusErrorKind;
 
 use super::bits::{END_OF_FRAME, crc15};
-use crate::can::Timing;
+use crate::can::BitTiming;
 
 /// What such a receiver makes of a frame.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -23,7 +23,7 @@ pub enum Heard {
 
 /// Listens with `timing` to bits of `bit_cycles(n)` core cycles from the start of frame to bit `n`'s
 /// start. After the last the bus is recessive.
-pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &Timing) -> Heard {
+pub fn listen(levels: &[bool], bit_start: impl Fn(usize) -> u64, timing: &BitTiming) -> Heard {
     let mut bus = Waveform { levels, bit_start, at: 0 };
     let mut parser = Parser::default();
     let (bit, to_sample) = (timing.bit(), timing.quantum * (1 + timing.segment1));
@@ -140,9 +140,9 @@ mod tests {
     use super::*;
     use crate::bus::bits::FrameBits;
 
-    fn timing(bit: u64) -> Timing {
+    fn timing(bit: u64) -> BitTiming {
         // 12 quanta, sample point at 75 %.
-        Timing { quantum: bit / 12, segment1: 8, segment2: 3, jump: 1 }
+        BitTiming { quantum: bit / 12, segment1: 8, segment2: 3, jump: 1 }
     }
 
     fn hear(text: &str, sender_bit: u64, receiver_bit: u64) -> Heard {

@@ -5,7 +5,7 @@ use cantap_can::BusErrorKind;
 use cantap_can::Frame;
 
 use super::bits::FrameBits;
-use super::outcome::{self, Outcome, Participant};
+use super::outcome::{self, FrameEnd, Participant};
 use super::{BitTime, Disturbance, Flight, Member, SYNC_BITS, Step, Wire, sampling};
 use crate::can::{CanPair, Mode};
 
@@ -75,7 +75,7 @@ impl Wire {
             })
             .collect();
         let disturbance = self.take_disturbance();
-        let outcome = Outcome::of(bits, &participants, disturbance);
+        let outcome = FrameEnd::of(bits, &participants, disturbance);
         count_dominant(&contest, &members, &participants, &outcome, can);
 
         let at = |bits: usize| start + bit.cycles(bits as u64);
@@ -249,7 +249,7 @@ fn count_dominant(
     contest: &Contest,
     members: &[Member],
     participants: &[Participant],
-    outcome: &Outcome,
+    outcome: &FrameEnd,
     can: &mut CanPair,
 ) {
     for (who, member) in members.iter().enumerate() {

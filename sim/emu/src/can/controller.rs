@@ -2,7 +2,7 @@
 
 mod node;
 
-use super::fault::Counters;
+use super::fault::ErrorCounters;
 use super::fifo::Fifo;
 use super::mailbox::Mailboxes;
 
@@ -102,7 +102,7 @@ pub enum Mode {
 
 /// A controller's bit timing in core cycles and quanta.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Timing {
+pub struct BitTiming {
     /// Core cycles of a quantum.
     pub quantum: u64,
     /// Quanta of the propagation and first phase segment.
@@ -113,7 +113,7 @@ pub struct Timing {
     pub jump: u64,
 }
 
-impl Timing {
+impl BitTiming {
     /// Core cycles of a bit.
     pub fn bit(&self) -> u64 {
         self.quantum * (1 + self.segment1 + self.segment2)
@@ -131,7 +131,7 @@ pub struct Controller {
     ier: u32,
     btr: u32,
     last_error: u32,
-    counters: Counters,
+    counters: ErrorCounters,
     mailboxes: Mailboxes,
     fifos: [Fifo; 2],
     /// The mailbox on the bus.
@@ -156,7 +156,7 @@ impl Default for Controller {
             ier: 0,
             btr: btr::RESET,
             last_error: 0,
-            counters: Counters::default(),
+            counters: ErrorCounters::default(),
             mailboxes: Mailboxes::default(),
             fifos: Default::default(),
             sending: None,

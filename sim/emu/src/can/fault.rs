@@ -14,12 +14,12 @@ const AFTER_GOOD_FRAME: u16 = 120;
 
 /// A node's two error counters.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counters {
+pub struct ErrorCounters {
     transmit: u16,
     receive: u16,
 }
 
-impl Counters {
+impl ErrorCounters {
     /// The transmit error counter, as its 8-bit register shows it.
     pub fn transmit(&self) -> u8 {
         self.transmit.min(255) as u8
@@ -82,7 +82,7 @@ mod tests {
 
     #[test]
     fn a_sender_is_warned_at_96_passive_at_128_and_off_at_256() {
-        let mut counters = Counters::default();
+        let mut counters = ErrorCounters::default();
         let mut seen = Vec::new();
         for _ in 0..32 {
             counters.transmit_error(BusErrorKind::BitDominant, true);
@@ -95,7 +95,7 @@ mod tests {
 
     #[test]
     fn a_lone_sender_stays_error_passive() {
-        let mut counters = Counters::default();
+        let mut counters = ErrorCounters::default();
         for _ in 0..1000 {
             counters.transmit_error(BusErrorKind::Acknowledgment, false);
         }
@@ -104,7 +104,7 @@ mod tests {
 
     #[test]
     fn a_passive_receiver_returns_to_120_with_one_good_frame() {
-        let mut counters = Counters::default();
+        let mut counters = ErrorCounters::default();
         for _ in 0..40 {
             counters.receive_error(true);
         }

@@ -4,7 +4,7 @@ use std::collections::VecDeque;
 
 use cantap_can::Frame;
 
-use super::identifier_word;
+use super::identifier::identifier_word;
 
 /// Mailboxes of a FIFO.
 pub const DEPTH: usize = 3;

@@ -9,12 +9,14 @@ mod controller;
 pub mod fault;
 pub mod fifo;
 pub mod filter;
+mod identifier;
 pub mod mailbox;
 
 use cantap_can::Frame;
 
-pub use controller::{Controller, MasterReset, Mode, Timing};
+pub use controller::{BitTiming, Controller, MasterReset, Mode};
 use filter::Filters;
+pub use identifier::identifier_word;
 
 /// Registers of CAN2 begin this far above CAN1's.
 const CAN2: u32 = 0x400;
@@ -97,11 +99,4 @@ impl CanPair {
             self.filters = Filters::default();
         }
     }
-}
-
-/// A frame's identifier as TIxR and RIxR hold it: STID or EXID, IDE, RTR.
-pub fn identifier_word(frame: &Frame) -> u32 {
-    let id = frame.id();
-    let identifier = if id.is_extended() { id.raw() << 3 | 1 << 2 } else { id.raw() << 21 };
-    identifier | u32::from(frame.is_remote()) << 1
 }

@@ -9,7 +9,8 @@ use rsemu::core::error::BusError;
 use rsemu::core::space::{AccessConstraints, MemAttrs, MemOps, MemResult, RamStore, Region};
 use rsemu::core::value::Width;
 
-use super::{Bus, Memory};
+use super::bus::Bus;
+use super::memory::Memory;
 use crate::memory_map as map;
 use crate::timing::{Delays, Posted};
 
@@ -126,7 +127,7 @@ enum Behind {
     Sram { base: u32 },
 }
 
-/// A memory whose accesses are told to the delays.
+/// A memory whose accesses are reported to the delays.
 struct Slow {
     behind: Behind,
     store: Arc<RamStore>,

@@ -1,9 +1,8 @@
-//! The chip around the core: address decode, clock gating, interrupt lines, and the two CAN buses that
-//! hang on it. An access to a register that no model knows is noted, never silently swallowed.
+//! The chip around the core: address decode, clock gating, interrupt lines, and the two CAN buses connected to it. An access to a register that no model knows is noted, never silently swallowed.
 
+pub mod bootloader;
 pub mod flash;
 pub mod rcc;
-pub mod rom;
 pub mod small;
 pub mod timer;
 
@@ -16,6 +15,7 @@ use crate::bus::Wire;
 use crate::can::CanPair;
 use crate::cpu::{Bus, Memories};
 use crate::memory_map as map;
+use crate::rom;
 use crate::timing::Speeds;
 use crate::{Clock, Peripheral};
 use flash::FlashInterface;
@@ -37,7 +37,7 @@ const GPIO_BASE: u32 = 0x4002_0000;
 /// A peripheral's registers are in a block of this size, or a multiple.
 const BLOCK: u32 = 0x400;
 
-/// For so many cycles of the slower bus a peripheral cannot be reached after its clock was switched on: one for the store to
+/// How many cycles of the slower bus a peripheral cannot be reached for after its clock was switched on: one for the store to
 /// arrive, and what ES0182 gives for APB, one and the bus's divider.
 const CLOCK_ENABLE_CYCLES: u64 = 4;
 

@@ -5,7 +5,7 @@
 //! the next one; there is one read at a time; and a jump away from a line's end waits for the next line, which the core
 //! had asked for by then.
 
-use super::Speeds;
+use super::speeds::Speeds;
 
 /// 128 bits.
 const LINE_BYTES: u32 = 16;

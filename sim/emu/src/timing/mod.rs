@@ -6,12 +6,14 @@
 //! allow; `docs/emulator.md` lists each figure with its source. A real chip lies between the two.
 
 mod flash;
+mod speeds;
 mod system_bus;
 
 use std::fmt;
 use std::str::FromStr;
 
 use flash::FlashReads;
+pub use speeds::Speeds;
 use system_bus::SystemBus;
 
 /// Cycles that a taken branch costs beyond rsemu's two for refilling the pipeline: the refill takes one to three (ARM
@@ -55,37 +57,6 @@ impl FromStr for Bound {
     }
 }
 
-/// What the program has set up that the times depend on.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Speeds {
-    /// Wait states of flash (FLASH_ACR.LATENCY).
-    pub wait_states: u64,
-    /// Whether the next line of instructions is read ahead (PRFTEN).
-    pub prefetch: bool,
-    /// Whether the instruction cache is on (ICEN).
-    pub instruction_cache: bool,
-    /// Whether the data cache is on (DCEN).
-    pub data_cache: bool,
-    /// Core cycles of a clock of APB1.
-    pub apb1: u64,
-    /// Core cycles of a clock of APB2.
-    pub apb2: u64,
-}
-
-impl Default for Speeds {
-    /// As after reset (RM0090 Rev 21 §3.9.1, §7.3.3).
-    fn default() -> Self {
-        Self {
-            wait_states: 0,
-            prefetch: false,
-            instruction_cache: false,
-            data_cache: false,
-            apb1: 1,
-            apb2: 1,
-        }
-    }
-}
-
 /// Cycles that one step of the core waited, by cause.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Waits {
@@ -120,7 +91,7 @@ pub struct Posted {
 }
 
 /// The state of [`Bound::Worst`]: what is where at which cycle. A step of the core is framed by [`Self::begin`] and
-/// [`Self::end`]; accesses in between are told as they happen.
+/// [`Self::end`]; accesses in between are reported as they happen.
 #[derive(Debug, Default)]
 pub struct Delays {
     speeds: Speeds,

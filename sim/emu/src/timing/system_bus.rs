@@ -5,7 +5,7 @@
 //! transfer takes two of its cycles, set-up and access (AMBA APB). ARM's own bridge adds a cycle of the faster clock where
 //! data is registered, as it is by default; ST does not say, so it is charged.
 
-use super::Speeds;
+use super::speeds::Speeds;
 
 /// Nobody has published what an access to AHB1's registers costs beyond the core's own two cycles.
 const AHB1: u64 = 2;
@@ -19,7 +19,7 @@ enum Slave {
     Sram,
     /// So many cycles for each access.
     Ahb(u64),
-    /// Behind a bridge, whose clock takes so many cycles.
+    /// Behind a bridge, whose clock takes this many cycles.
     Apb(u64),
 }
 

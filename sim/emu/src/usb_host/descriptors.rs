@@ -2,7 +2,7 @@
 //! section 9.6; CDC 1.2, section 5.2; PSTN 1.2, section 5.3). What a driver would stumble over is an error here, not a
 //! warning.
 
-use super::EnumerationError;
+use super::enumeration_error::EnumerationError;
 
 const DEVICE: u8 = 1;
 const CONFIGURATION: u8 = 2;

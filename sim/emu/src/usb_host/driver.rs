@@ -5,13 +5,16 @@
 use std::collections::VecDeque;
 
 use super::control::{Outcome, Request, Step, Transfer};
+use super::counters::Counters;
 use super::descriptors::{CdcAcm, Device};
-use super::{Counters, EnumerationError, HostDriver, Token};
+use super::enumeration_error::EnumerationError;
+use super::host_driver::{HostDriver, Token};
 use crate::otg::{InReply, OutReply};
 
 mod enumeration;
+mod purpose;
 
-use enumeration::Purpose;
+use purpose::Purpose;
 
 /// Bytes that the driver keeps for an application that does not read; then it stops asking.
 const INPUT_LIMIT: usize = 64 * 1024;

@@ -1,7 +1,7 @@
 //! What the bus needs of whoever drives the device: the emulator's own operating system ([`super::CdcDriver`]), or
-//! somebody else's behind a socket ([`crate::usbip`]).
+//! somebody else's, such as a kernel's behind a socket.
 
-use super::Counters;
+use super::counters::Counters;
 use crate::otg::{InReply, OutReply};
 
 /// A transaction that a driver wants on the bus.

@@ -7,14 +7,18 @@
 //! again after [`Timing::retry`].
 
 pub mod control;
+mod counters;
 mod descriptors;
 mod driver;
+mod enumeration_error;
 mod host_driver;
 mod timing;
 
 pub use control::{Outcome, Request, Step, Transfer};
+pub use counters::Counters;
 pub use descriptors::{CdcAcm, Device, Pipe};
 pub use driver::{Driver as CdcDriver, Identity, LineCoding};
+pub use enumeration_error::EnumerationError;
 pub use host_driver::{HostDriver, Token};
 pub use timing::Timing;
 
@@ -28,25 +32,6 @@ const OVERHEAD_BYTES: u64 = 13;
 const NAK_BYTES: u64 = 6;
 /// Silence after which a device must suspend (USB 2.0, 7.1.7.6).
 const IDLE_MS: u64 = 3;
-
-/// Why a device did not enumerate.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub enum EnumerationError {
-    /// A descriptor that drivers would refuse or misread.
-    #[error("descriptors: {0}")]
-    Descriptor(String),
-    /// A request that every device must support was refused.
-    #[error("{0} was refused")]
-    Refused(&'static str),
-    /// A transfer went wrong.
-    #[error("{what}: {how}")]
-    Transfer {
-        /// The request.
-        what: &'static str,
-        /// What was wrong with it.
-        how: &'static str,
-    },
-}
 
 /// What the port does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -82,29 +67,6 @@ pub enum Status {
     Failed(EnumerationError),
 }
 
-/// What a host counted.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub struct Counters {
-    /// Bulk IN packets.
-    pub in_packets: u64,
-    /// Bulk IN bytes.
-    pub in_bytes: u64,
-    /// Bulk OUT packets.
-    pub out_packets: u64,
-    /// Packets on the notification pipe.
-    pub notifications: u64,
-    /// Data packets with the toggle of the one before: repetitions after a lost handshake.
-    pub repeated: u64,
-    /// Transactions on configured pipes that the device left unanswered.
-    pub silences: u64,
-    /// STALLs of configured pipes.
-    pub stalls: u64,
-    /// Handshakes dropped on request.
-    pub dropped_handshakes: u64,
-    /// Enumerations that succeeded.
-    pub enumerations: u64,
-}
-
 /// A transaction on the bus, decided when it ends.
 #[derive(Debug)]
 struct Flight {
@@ -132,7 +94,7 @@ pub struct UsbHost<D = CdcDriver> {
     flight: Option<Flight>,
     next_transaction: u64,
     driver: D,
-    /// Lose the handshake of every so-many-th IN packet.
+    /// Lose the handshake of every n-th IN packet.
     drop_handshake_every: Option<u64>,
     counters: Counters,
     now: u64,

@@ -88,7 +88,7 @@ impl Timing {
     }
 
     /// Behind a high-speed hub, with a host that begins a transaction when it has fetched the one before, so that each
-    /// takes so many microframes. Hubs have room for more than one; a host that uses it is faster.
+    /// takes this many microframes. Hubs have room for more than one; a host that uses it is faster.
     #[must_use]
     pub fn behind_hub(self, microframes: u32) -> Self {
         Self { split: u64::from(microframes) * (self.clock.usb_frame() / 8), ..self }

@@ -52,7 +52,7 @@ impl<'a> SignalCollector<'a> {
         }
     }
 
-    /// Draws up to so many curves, in place of [`MOST_CURVES`].
+    /// Draws up to this many curves, in place of [`MOST_CURVES`].
     #[must_use]
     pub fn with_most_curves(self, most_curves: usize) -> Self {
         Self { most_curves, ..self }
@@ -133,7 +133,7 @@ impl<'a> SignalCollector<'a> {
         self.curves.is_empty()
     }
 
-    /// The picture: a pane per unit (and per so many curves as there are colours), one per signal without a unit, and a last one for digital signals.
+    /// The picture: a pane per unit (and per this many curves as there are colours), one per signal without a unit, and a last one for digital signals.
     pub fn finish(mut self, title: String) -> Plot {
         self.name_curves();
         let mut panes: Vec<Pane> = Vec::new();

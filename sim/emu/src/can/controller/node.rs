@@ -3,9 +3,9 @@
 use cantap_can::BusErrorKind;
 use cantap_can::Frame;
 
-use super::{Controller, Mode, RECOVERY_SEQUENCES, Timing, btr, ier, mcr, msr};
+use super::{BitTiming, Controller, Mode, RECOVERY_SEQUENCES, btr, ier, mcr, msr};
 use crate::bus::bits::{FrameBits, INTERMISSION};
-use crate::can::fault::Counters;
+use crate::can::fault::ErrorCounters;
 use crate::can::fifo::Fifo;
 use crate::can::filter::Match;
 use crate::can::mailbox::Attempt;
@@ -22,9 +22,9 @@ impl Controller {
     }
 
     /// The bit timing that BTR says.
-    pub fn timing(&self) -> Timing {
+    pub fn timing(&self) -> BitTiming {
         let field = |at: u32, bits: u32| u64::from(self.btr >> at & ((1 << bits) - 1)) + 1;
-        Timing {
+        BitTiming {
             quantum: field(0, 10) * self.cycles_per_clock,
             segment1: field(16, 4),
             segment2: field(20, 3),
@@ -48,7 +48,7 @@ impl Controller {
     }
 
     /// The error counters.
-    pub fn counters(&self) -> Counters {
+    pub fn counters(&self) -> ErrorCounters {
         self.counters
     }
 
@@ -134,12 +134,12 @@ impl Controller {
         self.end_attempt(Attempt::Failed);
     }
 
-    /// A frame it received failed; `first` as in [`Counters::receive_error`].
+    /// A frame it received failed; `first` as in [`ErrorCounters::receive_error`].
     pub(crate) fn receive_error(&mut self, kind: BusErrorKind, first: bool) {
         self.note(kind, |counters| counters.receive_error(first));
     }
 
-    fn note(&mut self, kind: BusErrorKind, count: impl FnOnce(&mut Counters)) {
+    fn note(&mut self, kind: BusErrorKind, count: impl FnOnce(&mut ErrorCounters)) {
         let before = self.counters;
         count(&mut self.counters);
         let after = self.counters;
@@ -200,7 +200,7 @@ impl Controller {
             *left = left.saturating_sub(sequences);
             if *left == 0 {
                 self.mode = Mode::Normal;
-                self.counters = Counters::default();
+                self.counters = ErrorCounters::default();
             }
         }
     }

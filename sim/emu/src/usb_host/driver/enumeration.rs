@@ -3,7 +3,9 @@
 use super::super::control::{
     CLEAR_FEATURE, ENDPOINT_HALT, Outcome, Request, SET_CONFIGURATION, SET_INTERFACE, Transfer,
 };
-use super::super::{EnumerationError, descriptors};
+use super::super::descriptors;
+use super::super::enumeration_error::EnumerationError;
+use super::purpose::Purpose;
 use super::{Driver, Identity, LineCoding, Pending};
 
 const GET_DESCRIPTOR: u8 = 6;
@@ -19,27 +21,6 @@ const CLASS_OUT: u8 = 0x21;
 
 /// Milliseconds that a device has to take its address (USB 2.0, 9.2.6.3: 2 ms; Linux waits 10).
 const ADDRESS_PAUSE_MS: u64 = 10;
-
-/// What a control transfer is for; enumeration goes through them in this order.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Purpose {
-    FirstLook,
-    Address,
-    DeviceDescriptor,
-    Qualifier,
-    ObjectStore,
-    ConfigurationHead,
-    Configuration,
-    Languages,
-    Text(usize),
-    Configure,
-    PutCoding,
-    GetCoding,
-    Lines,
-    /// The driver found a bulk pipe halted; its address.
-    ClearHalt(u8),
-    User,
-}
 
 impl Purpose {
     fn name(self) -> &'static str {

@@ -1,60 +1,16 @@
 //! The chip as the ROM bootloader leaves it when it starts the program that it was given (`dfu-util -s …:leave`).
 //!
 //! The bootloader undoes next to nothing: "the Jump to application works only if the user application sets the vector table
-//! correctly" (AN3156). What it sets up is told in AN2606, "STM32F40xxx/41xxx devices": HSE and PLL for USB, the pins of
+//! correctly" (AN3156). What it sets up is in AN2606, "STM32F40xxx/41xxx devices": HSE and PLL for USB, the pins of
 //! both USARTs, CAN2 and USB, SysTick and a timer to measure the crystal. That it leaves VTOR is what candleLight_fw's pull
 //! request 319 mends, that it leaves the PLL running numworks/epsilon's 329. The PLL's factors are not published: here they give
-//! USB its 48 MHz and the core the 60 MHz that AN2606 tells. What a real chip leaves may be less than this.
+//! USB its 48 MHz and the core the 60 MHz that AN2606 gives. What a real chip leaves may be less than this.
 
 use super::rcc::CRYSTAL_START_US;
 use super::{Board, flash};
 use crate::cpu::Cpu;
 use crate::memory_map as map;
-
-/// SYSCFG_MEMRMP: flash, or system memory, at address 0.
-pub const FLASH: u32 = 0;
-/// As [`FLASH`].
-pub const SYSTEM_MEMORY: u32 = 1;
-
-/// How the chip was started.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
-pub enum Start {
-    /// Power came on, and the boot pins chose flash.
-    #[default]
-    PowerOn,
-    /// The ROM bootloader has written the program and started it; the jumper that chose the bootloader is still in.
-    Bootloader,
-}
-
-/// Entry of the bootloader, as its vector table tells it: an odd address.
-pub const ENTRY: u32 = map::BOOTLOADER.start + 0x3DA5;
-const STACK: u32 = 0x2000_2D40;
-const ENDLESS: u32 = map::BOOTLOADER.start + 0x401;
-const RETURN: u32 = map::BOOTLOADER.start + 0x405;
-/// Exceptions of the core and of the chip.
-const VECTORS: usize = 16 + 82;
-const SYSTICK: usize = 15;
-
-/// What stands in for ST's code: its vectors, handlers that return for what it uses, an endless loop for the rest, and an
-/// undefined instruction at its entry, where a run ends.
-pub fn contents() -> Vec<u8> {
-    let mut vectors = [ENDLESS; VECTORS];
-    vectors[0] = STACK;
-    vectors[1] = ENTRY;
-    vectors[SYSTICK] = RETURN;
-    vectors[usize::from(map::OTG_FS_IRQ) + 16] = RETURN;
-    let mut contents = vec![0xFF; map::BOOTLOADER.len()];
-    let mut put = |address: u32, bytes: &[u8]| {
-        let at = ((address & !1) - map::BOOTLOADER.start) as usize;
-        contents[at..at + bytes.len()].copy_from_slice(bytes);
-    };
-    put(map::BOOTLOADER.start, &vectors.map(u32::to_le_bytes).concat());
-    // B to itself, BX LR, UDF.
-    put(ENDLESS, &0xE7FE_u16.to_le_bytes());
-    put(RETURN, &0x4770_u16.to_le_bytes());
-    put(ENTRY, &0xDE00_u16.to_le_bytes());
-    contents
-}
+use crate::rom::SYSTEM_MEMORY;
 
 const RCC: u32 = 0x4002_3800;
 const CR: u32 = RCC;

@@ -1,0 +1,25 @@
+//! Checks of the sources and the pages, which need parsers: where this program has none, it runs itself again with them.
+
+use anyhow::Result;
+
+/// Files that import each other in a circle, and public types of one name.
+pub fn circles() -> Result<()> {
+    #[cfg(feature = "check")]
+    return crate::circles::check();
+    #[cfg(not(feature = "check"))]
+    again("circles")
+}
+
+/// Links that lead nowhere.
+pub fn links() -> Result<()> {
+    #[cfg(feature = "check")]
+    return crate::links::check();
+    #[cfg(not(feature = "check"))]
+    again("links")
+}
+
+#[cfg(not(feature = "check"))]
+fn again(task: &str) -> Result<()> {
+    let shell = crate::workspace::shell()?;
+    Ok(xshell::cmd!(shell, "cargo run --locked --quiet -p xtask --features check -- {task}").quiet().run()?)
+}

@@ -154,7 +154,7 @@ fn in_a_file_one_goes_to_any_place_and_sees_what_it_has_up_to_there() {
     // From its end it begins anew.
     view.keys(" ");
     view.wait_for("playing ×1 0:0");
-    view.keys("....");
+    view.keys("...");
     view.wait_for("playing ×10 ");
     view.keys("q");
     assert_eq!(view.end(), 0);
@@ -210,7 +210,11 @@ fn a_vehicle_at_a_serial_port_is_known_by_its_signals() {
     view.wait_for("`cantap virtual car --dbc` prints it");
     view.wait_for("EngineSpeed");
     // A row opens, and a signal goes into the graph with its past.
-    view.keys("3/enginespeed\r\r4");
+    view.keys("3");
+    view.wait_for("Last 8 s");
+    view.keys("/enginespeed\r");
+    view.wait_until("no prompt", |screen| !screen.contains(" > "));
+    view.keys("\r4");
     let graph = view.wait_for("rpm EngineSpeed ");
     assert!(graph.contains(" UTC") && graph.contains("10 s, steps"), "{graph}");
     view.keys("xx");

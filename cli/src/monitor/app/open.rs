@@ -2,6 +2,8 @@
 
 use std::path::Path;
 
+use cantap_formats::Format;
+
 use super::super::model::Model;
 use super::state::App;
 use super::wish::Wish;
@@ -32,10 +34,10 @@ impl App {
         Ok(())
     }
 
-    /// A trace's name where a device's could stand.
+    /// A trace's name where a device's could stand, though no such file may be there: a slip must not close the device.
     pub(super) fn is_trace(text: &str) -> bool {
         let path = Path::new(text);
-        path.is_file() && !Address::is_meant_by(path)
+        !Address::is_meant_by(path) && (path.is_file() || Format::of_path(path).is_ok())
     }
 
     pub(super) fn open_beside(&mut self, path: &Path) -> Result<(), String> {

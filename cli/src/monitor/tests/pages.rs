@@ -255,6 +255,12 @@ fn a_trace_opens_beside_and_a_database_decodes_what_was_seen_before() {
     assert_eq!(app.wish.take(), Some(Wish::Beside(trace.clone().into())));
     press(&mut app, &mut model, &format!("O{trace}\n"));
     assert_eq!(app.wish.take(), Some(Wish::Beside(trace.into())));
+    // A slip of the pen is no device.
+    press(&mut app, &mut model, "D");
+    app.key(KeyEvent::new(KeyCode::Char('u'), KeyModifiers::CONTROL), &mut model);
+    press(&mut app, &mut model, "/nothing/drive.blf\n");
+    assert_eq!(app.message, "there is no file /nothing/drive.blf");
+    app.key(KeyEvent::from(KeyCode::Esc), &mut model);
     // Nothing of what runs was touched.
     assert!(orders.try_recv().is_err() && app.plan.is_some());
     press(&mut app, &mut model, "O/nothing.dbc\n");

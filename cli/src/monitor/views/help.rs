@@ -19,7 +19,7 @@ pub const KEYS: &[(&str, &str)] = &[
     ("/  n  N", "search this page, next, and the other way"),
     ("y", "trace: copy the selected frame"),
     ("arrows, Pg, End", "scroll; End is the newest"),
-    ("s  S  g", "fixed, signals: sort, reverse, group; headings can be clicked"),
+    ("s  S  g", "fixed, signals: sort, reverse, group; or click on headings"),
     ("#  *  H", "fixed: hide what changes anyway, show it again, bits' heat"),
     ("x  u  o", "fixed: hide the row, show all, colour the row"),
     ("Enter", "trace, fixed: signals; signals: into the graph; send: once"),

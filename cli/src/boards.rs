@@ -7,6 +7,7 @@ use cantap_trace::filter::Filter;
 
 use crate::address::{Address, OpenDevice};
 use crate::args::Channels;
+use crate::completion;
 use crate::wrong::wrong;
 
 /// More than this many boards no command takes: channels are numbered up to 32.
@@ -16,7 +17,7 @@ const MOST: usize = 16;
 #[derive(clap::Args, Clone, Debug)]
 pub struct OneBoard {
     /// Where the device is: a serial port, or virtual. Without it, the board that is connected, if there is one.
-    #[arg(short, long)]
+    #[arg(short, long, add = completion::devices())]
     device: Option<Address>,
 }
 

@@ -7,6 +7,7 @@ use cantap::TraceRecord;
 use cantap_formats::{Format, LeftOut, ReadOptions, TraceReader, Zone, open_reader};
 use cantap_trace::filter::Filter;
 
+use crate::completion;
 use crate::interrupt;
 use crate::live::{LiveArgs, LiveRecords};
 use crate::missing::Missing;
@@ -15,7 +16,7 @@ use crate::missing::Missing;
 #[derive(clap::Args)]
 pub struct ReadArgs {
     /// The trace's format, where neither its content nor its name tell, or tell the wrong one.
-    #[arg(long = "from", alias = "format", value_name = "FORMAT")]
+    #[arg(long = "from", alias = "format", value_name = "FORMAT", add = completion::formats())]
     pub format: Option<Format>,
     /// Wait for more at the end of the file, until Ctrl-C.
     #[arg(long)]

@@ -13,6 +13,7 @@ use crate::address::{Address, OpenDevice};
 use crate::boards::{Boards, filters_on, place_of};
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::{advice, args, interrupt, stderr};
 
@@ -20,14 +21,14 @@ use crate::{advice, args, interrupt, stderr};
 #[derive(clap::Args)]
 pub struct LiveArgs {
     /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
-    #[arg(short, long, conflicts_with = "input")]
+    #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
     /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
-    #[arg(short, long, default_value = "both", value_parser = args::channels)]
+    #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
     /// Bit rate of the bus in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be
     /// repeated. Without it, the one saved on the device.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
     /// Listen only for so long, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]

@@ -29,6 +29,7 @@ mod channel_args;
 mod channel_bitrate;
 mod clock;
 mod commands;
+mod completion;
 mod databases;
 mod exit;
 mod hearing;
@@ -42,6 +43,7 @@ mod monitor;
 mod progress;
 mod rescue;
 mod sending;
+mod shells;
 mod stderr;
 mod timing_args;
 mod trace_output;
@@ -55,6 +57,7 @@ use std::error::Error;
 use std::process::ExitCode;
 
 use clap::{CommandFactory, Parser};
+use clap_complete::CompleteEnv;
 
 /// Captures, understands and drives CAN buses with a cantap analyser.
 #[derive(Parser)]
@@ -69,6 +72,8 @@ struct Cli {
 }
 
 fn main() -> ExitCode {
+    // A shell asks, and the program ends here.
+    CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
     let cli = Cli::try_parse().unwrap_or_else(|error| leave(&error));
     match cli.command.run(Cli::command()) {
         Ok(code) => code,

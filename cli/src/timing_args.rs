@@ -7,13 +7,14 @@ use cantap::wire::{BitTiming, CHANNELS};
 use crate::advice;
 use crate::boards::place_of;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::wrong::wrong;
 
 /// A bit timing on the command line; for commands to flatten into theirs.
 #[derive(clap::Args, Clone, Debug, Default)]
 pub struct TimingArgs {
     /// Bit rate in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     pub bitrates: Vec<ChannelBitrate>,
     #[command(flatten)]
     wishes: Wishes,

@@ -8,6 +8,7 @@ use cantap_signals::trigger::{Trigger, Window};
 
 use crate::address::Address;
 use crate::args;
+use crate::completion;
 use crate::databases::DatabaseArgs;
 
 /// When to keep records; for commands to flatten into theirs.
@@ -15,7 +16,7 @@ use crate::databases::DatabaseArgs;
 pub struct TriggerArgs {
     /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123"
     /// or "error" (see cantap search --help).
-    #[arg(long, value_name = "CONDITION")]
+    #[arg(long, value_name = "CONDITION", add = completion::conditions())]
     pub trigger: Option<String>,
     /// Also keep what happened in this time before the condition held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]

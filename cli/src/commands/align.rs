@@ -12,6 +12,7 @@ use serde_json::{Value, json};
 
 use super::convert::{WriteArgs, refuse_same_file};
 use crate::args::duration;
+use crate::completion;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
 use crate::missing::Missing;
@@ -35,7 +36,7 @@ pub struct Args {
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
     /// The format of the traces, where neither their names nor their beginnings tell.
-    #[arg(long, value_name = "FORMAT")]
+    #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
     /// Stop at the first thing in a trace that is wrong instead of leaving it out.
     #[arg(long)]

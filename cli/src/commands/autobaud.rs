@@ -9,6 +9,7 @@ use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome, Progress};
 
 use crate::boards::OneBoard;
+use crate::completion;
 use crate::{args, interrupt};
 
 /// The command line.
@@ -21,7 +22,7 @@ pub struct Args {
     #[command(flatten)]
     device: OneBoard,
     /// Which channel: 1 or 2.
-    #[arg(short, long, default_value = "1", value_parser = args::channel)]
+    #[arg(short, long, default_value = "1", value_parser = args::channel, add = completion::channel())]
     channel: Channel,
     /// Give up after this time without any sign of traffic, but not before each common rate was tried once.
     #[arg(short, long, alias = "timeout", default_value = "10s", value_name = "TIME", value_parser = args::positive_duration)]

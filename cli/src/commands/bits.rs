@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use cantap::{FdBits, FdFrame, Frame, FrameBits, TraceFrame};
 
 use crate::args;
+use crate::completion;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -18,10 +19,10 @@ pub struct Args {
     /// passive sender, 3: both, 0: neither).
     frame: TraceFrame,
     /// Bit rate for the duration, in bit/s: 500000, 500k, 1M.
-    #[arg(short, long, value_name = "RATE", default_value = "1M", value_parser = args::bitrate)]
+    #[arg(short, long, value_name = "RATE", default_value = "1M", value_parser = args::bitrate, add = completion::bit_rates())]
     bitrate: u32,
     /// Bit rate of a CAN FD frame's data phase, if it switches.
-    #[arg(long, default_value = "2M", value_name = "RATE", value_parser = args::bitrate)]
+    #[arg(long, default_value = "2M", value_name = "RATE", value_parser = args::bitrate, add = completion::bit_rates())]
     data_bitrate: u32,
     /// Print one JSON object.
     #[arg(long)]

@@ -19,6 +19,7 @@ use super::convert::WriteArgs;
 use crate::address::Address;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
+use crate::completion;
 use crate::live::LiveRecords;
 use crate::meter::Meter;
 use crate::progress::Progress;
@@ -43,10 +44,10 @@ use crate::{args, stderr};
 pub struct Args {
     /// Where the device is: a serial port, or virtual. Repeat for several boards in one trace: the second one's channels are 3 and
     /// 4, and so on. Without it, the board that is connected.
-    #[arg(short, long = "device", value_name = "DEVICE")]
+    #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which is all.
-    #[arg(short, long, default_value = "both", value_parser = args::channels)]
+    #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,

@@ -37,7 +37,7 @@ pub struct Args {
     live: LiveArgs,
     /// Only this protocol, on every channel: isotp, uds, kwp2000 or obd. Several with commas, or repeated. isotp
     /// alone shows transfers as they are.
-    #[arg(short, long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
+    #[arg(long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
     protocols: Vec<Protocol>,
     /// Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as
     /// 6F1/12:612/F1. Can be repeated. Others are found by what they do.
@@ -46,7 +46,7 @@ pub struct Args {
     /// Only what went wrong: refusals, requests without a response, transfers that broke.
     #[arg(long)]
     faults: bool,
-    /// One JSON object per line.
+    /// Print one JSON object per line, and behind them one with the summary.
     #[arg(long)]
     json: bool,
     /// Leave out the summary.
@@ -97,6 +97,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         if records.may_wait() {
             out.flush()?;
         }
+    }
+    if args.json && !args.quiet {
+        let mut object = summary.object();
+        records.missing().put_into(&mut object);
+        writeln!(out, "{}", serde_json::json!({ "summary": object }))?;
     }
     out.flush()?;
     if !args.quiet {

@@ -9,6 +9,7 @@ use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableSt
 use cantap_trace::filter::Filter;
 
 use crate::args;
+use crate::completion;
 use crate::input::ReadArgs;
 use crate::interrupt;
 use crate::missing::by_kind;
@@ -41,7 +42,7 @@ pub struct Args {
     #[arg(value_name = "FILTER")]
     filters: Vec<Filter>,
     /// The format of IN, where neither its content nor its name tell, or tell the wrong one. All are listed below.
-    #[arg(long, value_name = "FORMAT")]
+    #[arg(long, value_name = "FORMAT", add = completion::formats())]
     from: Option<Format>,
     /// Wait for more at the end of IN, until Ctrl-C.
     #[arg(long)]
@@ -73,7 +74,7 @@ pub struct Args {
 pub struct WriteArgs {
     /// The format to write, where the file's name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
     /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, mf4, dif.
-    #[arg(long, visible_alias = "to", value_name = "FORMAT")]
+    #[arg(long, visible_alias = "to", value_name = "FORMAT", add = completion::written_formats())]
     format: Option<Format>,
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
     #[arg(long, value_name = "SIZE|TIME")]

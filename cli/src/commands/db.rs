@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use cantap_signals::Database;
 use serde_json::json;
 
+use crate::completion;
 use crate::input::ReadArgs;
 use crate::words::counted;
 
@@ -23,11 +24,11 @@ In a layout the highest bit is on the left; < is a signal's most significant bit
 X a bit that several signals have.")]
 pub struct Args {
     /// The databases.
-    #[arg(required = true, value_name = "FILE")]
+    #[arg(required = true, value_name = "FILE", add = completion::databases())]
     files: Vec<PathBuf>,
     /// Show these messages in full: layout, signals, texts, comments. A name with *, ? and [a-z], or an identifier in hexadecimal
     /// (3 or 8 digits). Can be repeated.
-    #[arg(long = "message", value_name = "PATTERN")]
+    #[arg(long = "message", value_name = "PATTERN", add = completion::messages())]
     messages: Vec<String>,
     /// Compare with this trace: which identifiers the databases lack, which messages never came, actual against nominal cycles.
     #[arg(long, value_name = "TRACE", conflicts_with = "messages")]

@@ -20,6 +20,7 @@ use cantap_signals::Decoder;
 use self::decoded::Decoded;
 use self::wide::Wide;
 use crate::args;
+use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
@@ -47,7 +48,7 @@ pub struct Args {
     live: LiveArgs,
     /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Several with commas, or
     /// repeated.
-    #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',')]
+    #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
     signals: Vec<String>,
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::{ChannelArgs, mode_name};
+use crate::completion;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -40,7 +41,7 @@ struct Save {
     #[command(flatten)]
     device: OneBoard,
     /// Which channels: 1, 2 or both. The other one keeps what is stored for it.
-    #[arg(short, long, default_value = "both", value_parser = args::channels_of_one)]
+    #[arg(short, long, default_value = "both", value_parser = args::channels_of_one, add = completion::channels())]
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,

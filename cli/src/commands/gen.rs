@@ -15,6 +15,7 @@ use serde_json::{Value, json};
 use crate::args;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
+use crate::completion;
 use crate::interrupt;
 use crate::meter::rounded;
 use crate::sending::Sending;
@@ -33,7 +34,7 @@ pub struct Args {
     #[command(flatten)]
     device: OneBoard,
     /// can0 or 1, can1 or 2; or both.
-    #[arg(value_parser = channels)]
+    #[arg(value_parser = channels, add = completion::channels())]
     channel: Channels,
     #[command(flatten)]
     open: ChannelArgs,

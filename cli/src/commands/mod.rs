@@ -112,7 +112,7 @@ impl Command {
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
             Self::Conversations(args) => conversations::run(&args),
-            Self::Completions(args) => completions::run(&args, line),
+            Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),
             Self::Decode(args) => decode::run(&args),

@@ -14,6 +14,7 @@ use crate::address::{Address, AddressError};
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::databases::{DatabaseArgs, Databases, Said};
 use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
@@ -40,10 +41,10 @@ pub struct Args {
     #[arg(value_name = "FILE|DEVICE", conflicts_with = "devices")]
     file: Option<PathBuf>,
     /// The device. Repeat for several, whose channels are numbered on: the second one's are 3 and 4.
-    #[arg(short, long = "device", value_name = "DEVICE")]
+    #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which is all. Without it, those whose bit rate is given; all if none is.
-    #[arg(short, long, value_parser = args::channels)]
+    #[arg(short, long, value_parser = args::channels, add = completion::channels())]
     channel: Option<args::Channels>,
     #[command(flatten)]
     open: ChannelArgs,

@@ -15,6 +15,7 @@ use cantap_analysis::stats::Options;
 use cantap_formats::time_range::{TimePoint, TimeRange, date_text};
 
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::missing::Missing;
@@ -37,16 +38,16 @@ pub struct Args {
     #[command(flatten)]
     databases: DatabaseArgs,
     /// Signals to draw, by name or Message.Signal; with *, ? and [a-z]. Can be repeated. All without it.
-    #[arg(short, long = "signal", value_name = "PATTERN")]
+    #[arg(short, long = "signal", value_name = "PATTERN", add = completion::signals())]
     signals: Vec<String>,
     /// Draw the bus load over time, or frames/s where no bit rate is given.
     #[arg(long, conflicts_with_all = ["signals", "timing"])]
     bus_load: bool,
     /// Draw how long the periods of this identifier are: 3 hexadecimal digits, or 8 for 29 bits.
-    #[arg(long, value_name = "ID", conflicts_with = "signals")]
+    #[arg(long, value_name = "ID", conflicts_with = "signals", add = completion::identifiers())]
     timing: Option<Id>,
     /// The bit rate for the load, such as 500k, or 2:250k for one channel.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", requires = "bus_load", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
     /// Length of the load's windows.
     #[arg(short, long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]

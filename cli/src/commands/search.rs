@@ -14,6 +14,7 @@ use cantap_signals::{Decoder, SignalValue};
 use cantap_trace::Interface;
 
 use super::decode;
+use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::exit;
 use crate::input::{ReadArgs, Records};
@@ -39,13 +40,13 @@ pub struct Args {
     #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
     /// What must hold, such as "Speed > 80 and Gear == 3".
-    #[arg(value_name = "CONDITION", conflicts_with = "condition")]
+    #[arg(value_name = "CONDITION", conflicts_with = "condition", add = completion::conditions())]
     positional: Option<String>,
     /// The condition, as an option.
-    #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION")]
+    #[arg(short = 'e', long = "condition", visible_alias = "where", value_name = "CONDITION", add = completion::conditions())]
     condition: Option<String>,
     /// This identifier: 123, 18FEF1?? with ? for any digit, or 100-1FF. Repeat for any of several.
-    #[arg(short, long = "id", value_name = "ID")]
+    #[arg(short, long = "id", value_name = "ID", add = completion::identifiers())]
     ids: Vec<IdPattern>,
     /// These data bytes from the first on: "11 ?? 3?"; * for any number. Repeat for any of several.
     #[arg(long, value_name = "BYTES")]

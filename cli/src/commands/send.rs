@@ -18,6 +18,7 @@ use modifiers::Modifiers;
 
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
+use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::meter::rounded;
 use crate::sending::{LOOK_EVERY, Sending};
@@ -36,10 +37,10 @@ pub struct Args {
     #[command(flatten)]
     device: OneBoard,
     /// 1 or 2; can0 is channel 1, can1 is channel 2.
-    #[arg(value_parser = channel)]
+    #[arg(value_parser = channel, add = completion::channel())]
     channel: Channel,
     /// The frames, in this order.
-    #[arg(required = true, value_name = "FRAME")]
+    #[arg(required = true, value_name = "FRAME", add = completion::values())]
     frames: Vec<String>,
     #[command(flatten)]
     open: ChannelArgs,

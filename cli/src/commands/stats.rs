@@ -16,6 +16,7 @@ use self::windows::Windows;
 use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
+use crate::completion;
 use crate::input::ReadArgs;
 use crate::missing::{Missing, by_kind};
 
@@ -35,11 +36,11 @@ pub struct Args {
     input: Option<PathBuf>,
     /// Listen to a device instead of reading a file, until Ctrl-C. Repeat for several, whose channels are numbered on.
     /// Without it and a file, the board that is connected is listened to.
-    #[arg(short, long, conflicts_with = "input")]
+    #[arg(short, long, conflicts_with = "input", add = completion::devices())]
     device: Vec<Address>,
     /// The bus's bit rate, such as 500k; with a channel before it (2:250k), that channel's only. Can be
     /// repeated. A file has no load without it; a device is listened to at the saved one.
-    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
     /// The bit rate of CAN FD's data phases, such as 2M; with a channel before it (2:5M), that channel's only. Can be
     /// repeated. Without it a channel with switched bit rates has no load.
@@ -47,11 +48,12 @@ pub struct Args {
         long = "data-bitrate",
         value_name = "[CHANNEL:]RATE",
         conflicts_with = "device",
-        requires = "bitrates"
+        requires = "bitrates",
+        add = completion::bit_rates()
     )]
     data_bitrates: Vec<ChannelBitrate>,
     /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
-    #[arg(short, long, default_value = "both", value_parser = args::channels)]
+    #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
     /// Listen only for so long.
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]

@@ -11,6 +11,7 @@ use serde_json::{Value, json};
 
 use crate::boards::OneBoard;
 use crate::channel_args::{ChannelArgs, mode_name};
+use crate::completion;
 use crate::wrong::wrong;
 use crate::{args, clock, interrupt};
 
@@ -30,7 +31,7 @@ pub struct Args {
     #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.
-    #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels_of_one)]
+    #[arg(short, long, default_value = "both", requires = "time", value_parser = args::channels_of_one, add = completion::channels())]
     channel: args::Channels,
     #[command(flatten)]
     open: ChannelArgs,

@@ -6,6 +6,7 @@ use std::process::ExitCode;
 use cantap::bit_timing::{self, Assessment, LINE_DELAY_NS_PER_M, NODE_DELAY_NS, TimingRequest};
 
 use crate::args;
+use crate::completion;
 use crate::timing_args::Wishes;
 
 /// The command line.
@@ -18,7 +19,7 @@ use crate::timing_args::Wishes;
 )]
 pub struct Args {
     /// Bit rate in bit/s: 500000, 500k, 1M.
-    #[arg(short, long, value_name = "RATE", value_parser = args::bitrate)]
+    #[arg(short, long, value_name = "RATE", value_parser = args::bitrate, add = completion::bit_rates())]
     bitrate: u32,
     /// Clock of the CAN controller in Hz: 36000000, 36M. cantap's boards have 36 MHz.
     #[arg(long, value_name = "HZ", default_value = "36M", value_parser = clock)]

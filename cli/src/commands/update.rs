@@ -7,6 +7,7 @@ use std::process::{Command, ExitCode};
 use anyhow::{Context, bail};
 
 use crate::address::Address;
+use crate::completion;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -18,7 +19,7 @@ use crate::address::Address;
 )]
 pub struct Args {
     /// Where the device is: a serial port.
-    #[arg(short, long)]
+    #[arg(short, long, add = completion::devices())]
     device: Address,
     /// The firmware, as a raw image for address 0x08000000.
     file: PathBuf,

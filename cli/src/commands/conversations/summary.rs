@@ -33,6 +33,20 @@ impl Summary {
         *faults += u64::from(super::is_fault(event));
     }
 
+    pub fn object(&self) -> serde_json::Value {
+        let counts = |pick: fn(&(u64, u64)) -> u64| -> serde_json::Map<_, _> {
+            let some = self.events.iter().filter(|(_, counts)| pick(counts) > 0);
+            some.map(|(protocol, counts)| (protocol.to_string(), pick(counts).into())).collect()
+        };
+        serde_json::json!({
+            "frames": self.frames,
+            "lost": self.lost,
+            "gaps": self.gaps,
+            "events": counts(|(all, _)| *all),
+            "faults": counts(|(_, faults)| *faults),
+        })
+    }
+
     pub fn tell(&self) {
         let mut said = Vec::new();
         for (protocol, (all, faults)) in &self.events {

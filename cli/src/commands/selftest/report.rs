@@ -39,7 +39,7 @@ struct Step {
 pub struct Report {
     cantap: &'static str,
     host: String,
-    unix_seconds: u64,
+    time_s: u64,
     device: String,
     board: String,
     serial_number: String,
@@ -62,7 +62,7 @@ impl Report {
         let report = Self {
             cantap: env!("CARGO_PKG_VERSION"),
             host: host(),
-            unix_seconds: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs()),
+            time_s: SystemTime::now().duration_since(UNIX_EPOCH).map_or(0, |since| since.as_secs()),
             device: address.to_string(),
             board: hello.board.as_str().to_owned(),
             serial_number: hello.serial.as_str().to_owned(),

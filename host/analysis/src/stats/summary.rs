@@ -41,6 +41,7 @@ pub struct ChannelSummary {
     #[serde(rename = "bitrate_bps")]
     pub bitrate: Option<u32>,
     /// The bit rate of its data phases in bit/s, if it was given.
+    #[serde(rename = "data_bitrate_bps")]
     pub data_bitrate: Option<u32>,
     /// Frames, sent and received.
     pub frames: u64,

@@ -16,7 +16,6 @@ use ratatui::widgets::{Block, Borders, Paragraph, Wrap};
 
 use super::super::app::{App, Drawn};
 use super::super::model::{Seen, Series, SignalRow};
-use super::super::theme::Theme;
 use super::super::times::clock;
 use super::signals::short;
 use axis::GUTTER;

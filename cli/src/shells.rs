@@ -1,0 +1,153 @@
+//! How shells ask for what may stand at a place of the command line: they run `cantap` with an environment variable, and the line's
+//! words behind `--`.
+
+use std::ffi::OsString;
+use std::io::{self, Write};
+use std::path::Path;
+
+use clap_complete::Shell;
+use clap_complete::engine::complete;
+use clap_complete::env::{Elvish, EnvCompleter, Fish, Powershell, Shells, Zsh};
+
+/// It names the shell that asks.
+pub const VARIABLE: &str = "CANTAP_COMPLETE";
+
+/// All that are known.
+pub const ALL: Shells<'static> = Shells(&[&Bash, &Elvish, &Fish, &Powershell, &Zsh]);
+
+/// The script that makes a shell ask; it runs `cantap` from wherever it is found.
+pub fn script(shell: Shell) -> io::Result<Vec<u8>> {
+    let completer = ALL.completer(&shell.to_string());
+    let completer =
+        completer.ok_or_else(|| io::Error::other(format!("there is no completion for {shell}")))?;
+    let mut script = Vec::new();
+    completer.write_registration(VARIABLE, "cantap", "cantap", "cantap", &mut script)?;
+    Ok(script)
+}
+
+/// The words of the line that a shell asks about.
+pub fn words() -> Vec<String> {
+    let words = std::env::args_os().skip_while(|word| word != "--").skip(1).collect();
+    let (words, _) = join(words, 0);
+    words.into_iter().filter_map(|word| word.into_string().ok()).collect()
+}
+
+/// Bash takes a line apart at colons and equals signs, and puts what it is given in the place of the last part alone.
+struct Bash;
+
+/// Bash's number of the word that the cursor is in.
+const WORD: &str = "_CANTAP_WORD";
+
+/// A part that only separates others.
+fn separates(word: &OsString) -> bool {
+    let bytes = word.as_encoded_bytes();
+    !bytes.is_empty() && bytes.iter().all(|byte| matches!(byte, b':' | b'='))
+}
+
+/// Puts the parts of words together again. Of the part with the number `at`: the number of its word, and what of that is before
+/// the part, or before the cursor where the part only separates.
+fn join(parts: Vec<OsString>, at: usize) -> (Vec<OsString>, (usize, OsString)) {
+    let mut words: Vec<OsString> = Vec::new();
+    let mut place = (0, OsString::new());
+    let mut goes_on = false;
+    for (number, part) in parts.into_iter().enumerate() {
+        let is_separator = separates(&part);
+        let mut word =
+            if goes_on || is_separator { words.pop().unwrap_or_default() } else { OsString::new() };
+        if number == at && !is_separator {
+            place.1.clone_from(&word);
+        }
+        word.push(part);
+        if number == at && is_separator {
+            place.1.clone_from(&word);
+        }
+        words.push(word);
+        if number == at {
+            place.0 = words.len() - 1;
+        }
+        goes_on = is_separator;
+    }
+    (words, place)
+}
+
+impl EnvCompleter for Bash {
+    fn name(&self) -> &'static str {
+        "bash"
+    }
+
+    fn is(&self, name: &str) -> bool {
+        name == "bash"
+    }
+
+    fn write_registration(
+        &self,
+        variable: &str,
+        name: &str,
+        bin: &str,
+        completer: &str,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
+        // Nothing is sorted anew and nothing ends in a blank that more may follow; bash before 4.4 and 4.0 cannot do that.
+        write!(
+            out,
+            r#"_{name}() {{
+    local IFS=$'\n'
+    COMPREPLY=( $({variable}=bash {WORD}="$COMP_CWORD" {completer} -- "${{COMP_WORDS[@]}}" 2>/dev/null) )
+    if [[ "${{COMPREPLY-}}" == *[=/:,] ]]; then
+        compopt -o nospace 2>/dev/null
+    fi
+}}
+complete -o bashdefault -o nosort -F _{name} {bin} 2>/dev/null || complete -o bashdefault -F _{name} {bin}
+"#
+        )
+    }
+
+    fn write_complete(
+        &self,
+        command: &mut clap::Command,
+        parts: Vec<OsString>,
+        folder: Option<&Path>,
+        out: &mut dyn Write,
+    ) -> io::Result<()> {
+        let at =
+            std::env::var(WORD).ok().and_then(|at| at.parse().ok()).unwrap_or(parts.len().saturating_sub(1));
+        let (words, (word, before)) = join(parts, at);
+        let before = before.to_string_lossy();
+        for candidate in complete(command, words, word, folder)? {
+            let whole = candidate.get_value().to_string_lossy();
+            if let Some(rest) = whole.strip_prefix(&*before) {
+                writeln!(out, "{rest}")?;
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_bash_takes_apart_is_put_together_again() {
+        let joined = |parts: &str, at| {
+            let (words, (word, before)) = join(parts.split(' ').map(OsString::from).collect(), at);
+            let words: Vec<_> = words.into_iter().map(|word| word.into_string().unwrap()).collect();
+            (words.join(" "), word, before.into_string().unwrap())
+        };
+        assert_eq!(joined("cantap capture -d", 2), ("cantap capture -d".into(), 2, String::new()));
+        assert_eq!(
+            joined("cantap capture -d virtual : c", 5),
+            ("cantap capture -d virtual:c".into(), 3, "virtual:".into())
+        );
+        // The cursor is behind the colon, which bash counts as the word.
+        assert_eq!(
+            joined("cantap capture -d virtual :", 4),
+            ("cantap capture -d virtual:".into(), 3, "virtual:".into())
+        );
+        assert_eq!(
+            joined("cantap decode --db = 2 : car.dbc -s Sp", 8),
+            ("cantap decode --db=2:car.dbc -s Sp".into(), 4, String::new())
+        );
+        assert_eq!(joined("cantap decode --db = 2", 4), ("cantap decode --db=2".into(), 2, "--db=".into()));
+    }
+}

@@ -212,7 +212,7 @@ fn a_vehicle_at_a_serial_port_is_known_by_its_signals() {
     // A row opens, and a signal goes into the graph with its past.
     view.keys("3");
     view.wait_for("Last 8 s");
-    view.keys("/enginespeed\r");
+    view.keys("/.enginespeed\r");
     view.wait_until("no prompt", |screen| !screen.contains(" > "));
     view.keys("\r4");
     let graph = view.wait_for("rpm EngineSpeed ");

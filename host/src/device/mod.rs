@@ -37,13 +37,15 @@ pub use clock::{
 pub(crate) use error::no_timing;
 pub use error::{DeviceError, SessionOver};
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
-pub use link::Link;
+pub use link::{Link, is_idle};
 pub use pipe::{PipeReader, PipeWriter, pipe};
+pub use reader::{encode, write_patiently};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
-pub use serial::{Board, list, port_of};
+pub use serial::{Board, list, open as open_port, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
+pub use watch::{Next, Watch};
 
 use crate::TraceRecord;
 use reader::{Answer, Order, Shared};

@@ -281,7 +281,8 @@ fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {
 #[test]
 fn what_cannot_be_served_is_said_at_once() {
     for (arguments, code, part) in [
-        ("serve -d virtual -b 500k --tcp 0.0.0.0", 2, "everybody on the network"),
+        ("serve -d virtual -b 500k --tcp 0.0.0.0", 2, "everybody on every network"),
+        ("serve -d virtual -b 500k --tcp 192.0.2.1", 2, "everybody on the network"),
         ("serve -d virtual -b 500k --tcp here", 2, "write it as 127.0.0.1:29537"),
         ("serve -d virtual -b 3:500k", 2, "no channel 3"),
         ("serve -d virtual -b 500k --unix /nowhere/at/all", 1, "no socket can be made at '/nowhere/at/all'"),

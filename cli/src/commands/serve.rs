@@ -13,7 +13,7 @@ use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
 use cantap::{Channel, DeviceError};
 use cantap_serve::listen::{self, Listening};
-use cantap_serve::{Board, BoardError, News, Role, Settings, connect};
+use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
 
 use crate::address::Address;
 use crate::args::Channels;
@@ -55,6 +55,13 @@ pub struct Args {
     /// Listen on a TCP port of this computer, which all its users can reach; 127.0.0.1:29537 unless given.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     tcp: Option<String>,
+    /// Speak the socketcand protocol, for SavvyCAN, Kayak and python-can; at 127.0.0.1:29536 unless given. At an address that other
+    /// computers reach, clients may only listen: the protocol does not ask who they are.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    socketcand: Option<String>,
+    /// Write candump's log lines to whoever connects, for nc and SavvyCAN's log server; at 127.0.0.1:29538 unless given.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    lines: Option<String>,
     /// Serve one client through standard input and output, as ssh starts it.
     #[arg(long)]
     stdio: bool,
@@ -62,6 +69,8 @@ pub struct Args {
 
 /// How often to check whether to end.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// The port of `--lines`, unless another is given.
+const LINES_PORT: u16 = 29_538;
 /// Bytes of standard input that wait at most.
 const STDIN_BYTES: usize = 16 * 1024;
 
@@ -75,7 +84,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut timing = TimingArgs::default();
     timing.set_bit_rates(args.bitrates.clone());
     timing.check_channels(addresses.len())?;
-    let tcp = args.tcp.as_deref().map(loopback).transpose()?;
+    let tcp = args.tcp.as_deref().map(|text| loopback(text, PORT)).transpose()?;
+    let beside = Beside {
+        socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
+        lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
+    };
     // From here on Ctrl-C ends it in order.
     interrupt::watch()?;
     let mut boards = Vec::new();
@@ -87,7 +100,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], args.allow);
     }
-    let listening = listen(args, tcp, &boards)?;
+    let listening = listen(args, tcp, &beside, &boards)?;
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
@@ -147,17 +160,28 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
     }
 }
 
-/// An address of this computer.
-fn loopback(text: &str) -> anyhow::Result<SocketAddr> {
-    let not_one = || wrong(format!("'{text}' is no address to listen at; write it as 127.0.0.1:{PORT}"));
+/// An address, a port of this computer, or both.
+fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
+    let not_one = || wrong(format!("'{text}' is no address to listen at; write it as 127.0.0.1:{port}"));
     let address: SocketAddr = match text.parse() {
         Ok(address) => address,
         Err(_) => match (text.parse(), text.parse()) {
-            (Ok(ip), _) => SocketAddr::new(ip, PORT),
+            (Ok(ip), _) => SocketAddr::new(ip, port),
             (_, Ok(port)) => SocketAddr::from((Ipv4Addr::LOCALHOST, port)),
             _ => return Err(not_one()),
         },
     };
+    if address.ip().is_unspecified() {
+        return Err(wrong(format!(
+            "at {address} everybody on every network could use the device; name one address of this computer"
+        )));
+    }
+    Ok(address)
+}
+
+/// An address that only this computer reaches.
+fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
+    let address = address(text, port)?;
     if !address.ip().is_loopback() {
         return Err(wrong(format!(
             "at {address} everybody on the network could use the device; listen at 127.0.0.1 and let clients come by ssh \
@@ -168,7 +192,12 @@ fn loopback(text: &str) -> anyhow::Result<SocketAddr> {
 }
 
 /// Opens every way in and prints it.
-fn listen(args: &Args, tcp: Option<SocketAddr>, boards: &[Arc<Board>]) -> anyhow::Result<Vec<Listening>> {
+fn listen(
+    args: &Args,
+    tcp: Option<SocketAddr>,
+    beside: &Beside,
+    boards: &[Arc<Board>],
+) -> anyhow::Result<Vec<Listening>> {
     let mut ways = Vec::new();
     let mut said = Vec::new();
     for (number, board) in boards.iter().enumerate() {
@@ -204,11 +233,16 @@ fn listen(args: &Args, tcp: Option<SocketAddr>, boards: &[Arc<Board>]) -> anyhow
         }
         said.push((board.name(), names));
     }
+    let other = beside.listen(args.allow, boards)?;
     let mut out = io::stdout().lock();
     for (_, names) in &said {
         for name in names {
             writeln!(out, "{name}")?;
         }
+    }
+    for (name, way) in other {
+        writeln!(out, "{name}")?;
+        ways.push(way);
     }
     out.flush()?;
     for (board, names) in &said {
@@ -219,6 +253,35 @@ fn listen(args: &Args, tcp: Option<SocketAddr>, boards: &[Arc<Board>]) -> anyhow
         );
     }
     Ok(ways)
+}
+
+/// Other programs' ways in, each to all boards.
+struct Beside {
+    socketcand: Option<SocketAddr>,
+    lines: Option<SocketAddr>,
+}
+
+impl Beside {
+    /// Opens them. Returns what each is called.
+    fn listen(&self, role: Role, boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
+        let mut ways = Vec::new();
+        if let Some(address) = self.socketcand {
+            let way = socketcand::listen(boards, address, role).with_context(|| {
+                format!("nobody can listen at {address}; give another port with --socketcand")
+            })?;
+            let address = way.address().unwrap_or(address);
+            if !address.ip().is_loopback() {
+                stderr::warn(&format!("whoever reaches {address} can hear the buses; nobody can send there"));
+            }
+            ways.push((format!("can://{address}"), way));
+        }
+        if let Some(address) = self.lines {
+            let way = lines::listen(boards, address)
+                .with_context(|| format!("nobody can listen at {address}; give another port with --lines"))?;
+            ways.push((format!("lines at {}", way.address().unwrap_or(address)), way));
+        }
+        Ok(ways)
+    }
 }
 
 /// The path of a further device.
@@ -258,12 +321,12 @@ mod tests {
 
     #[test]
     fn only_addresses_of_this_computer_are_listened_at() {
-        let at = |text: &str| loopback(text).map(|address| address.to_string());
+        let at = |text: &str| loopback(text, PORT).map(|address| address.to_string());
         assert_eq!(at("127.0.0.1").unwrap(), format!("127.0.0.1:{PORT}"));
         assert_eq!(at("5000").unwrap(), "127.0.0.1:5000");
         assert_eq!(at("[::1]:5000").unwrap(), "[::1]:5000");
         for wrong in ["0.0.0.0", "192.168.0.1:5000", "[::]:1", "car", ""] {
-            assert!(loopback(wrong).is_err(), "{wrong}");
+            assert!(loopback(wrong, PORT).is_err(), "{wrong}");
         }
     }
 

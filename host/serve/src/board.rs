@@ -397,10 +397,8 @@ impl Session {
                 },
             };
         }
-        let ticks = match exchange(id.wrapping_add(1), Command::Time)?.ok_or_else(not_cantap)? {
-            Ok(Reply::Time(ticks)) => ticks,
-            _ => return Err(DeviceError::WrongReply),
-        };
+        let time = exchange(id.wrapping_add(1), Command::Time)?.ok_or_else(not_cantap)?;
+        let Ok(Reply::Time(ticks)) = time else { return Err(DeviceError::WrongReply) };
         Ok(Self { link: Link { reader, writer, keep_alive }, decoder, hello, base, ticks })
     }
 

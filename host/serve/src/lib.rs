@@ -10,11 +10,14 @@ mod board;
 mod client;
 pub mod connect;
 mod inbox;
+pub mod lines;
 pub mod listen;
 mod news;
 mod outbox;
+pub mod socketcand;
 mod state;
 mod stream;
+mod text;
 mod writer;
 
 pub use board::{Board, BoardError, Connect, ConnectError, Refused, Settings};

@@ -90,8 +90,13 @@ impl Device {
 
     /// Talks to the device at the other end of a byte stream; `name` is what messages call it.
     pub fn over(link: Link, name: &str) -> Result<Self, DeviceError> {
+        Self::over_holding(link, name, BUFFER_RECORDS)
+    }
+
+    /// The same, and at most so many records wait for who takes them; others are lost, and counted.
+    pub fn over_holding(link: Link, name: &str, records: usize) -> Result<Self, DeviceError> {
         let Link { reader, writer, keep_alive } = link;
-        let shared = Arc::new(Shared::new(name, writer, BUFFER_RECORDS));
+        let shared = Arc::new(Shared::new(name, writer, records));
         let (orders, received_orders) = std::sync::mpsc::channel();
         let for_thread = Arc::clone(&shared);
         let thread = std::thread::Builder::new()

@@ -43,6 +43,7 @@ mod monitor;
 mod progress;
 mod rescue;
 mod sending;
+mod server;
 mod shells;
 mod stderr;
 mod timing_args;

@@ -8,14 +8,16 @@ use crate::{CHANNELS, Channel};
 
 mod bytes;
 mod channel;
+mod sharing;
 mod status;
 mod transmission;
 
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
+pub use sharing::Role;
 pub use status::{ChannelStatus, Failures, MAX_FAILURE_TEXT, RegisterSet, Registers, Status};
 pub use transmission::{
-    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, Periodic, TRIGGER_TAG, Trigger, TxFrame,
+    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, OTHERS_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame,
 };
 
 /// Most filters that one channel takes; the hardware's banks may be exhausted earlier.
@@ -72,6 +74,10 @@ pub struct SessionEnd {
 pub enum EndReason {
     /// The host suspended the bus, and woke it again without having closed the port.
     Suspended,
+    /// Never from a device: the server of a shared board has lost it.
+    BoardLost,
+    /// Never from a device: the server of a shared board has ended.
+    ServerEnded,
 }
 
 /// The one answer that every request gets.
@@ -283,6 +289,17 @@ pub enum Refusal {
     NothingSaved,
     /// The controller is not bus-off.
     NotBusOff,
+    /// Never from a device: the server of a shared board does not let this client do that.
+    NotGranted {
+        /// What it would have to be granted.
+        needs: Role,
+    },
+    /// Never from a device: another client of the server holds the right to configure.
+    Held,
+    /// Never from a device: other clients of the server have the channel open, with another bit timing or mode.
+    OtherSettings,
+    /// Never from a device: the server has no board at the moment.
+    NoBoard,
 }
 
 /// What a device is. The first field's encoding never changes between versions.

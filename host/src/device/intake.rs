@@ -18,7 +18,7 @@ pub const PIECE_BYTES: usize = 4096;
 /// What was received and lost on one channel since the session began.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ChannelCounters {
-    /// Frames that arrived from the device.
+    /// Frames that arrived from the device, at this program or at the server of a shared board.
     pub received: u64,
     /// Times the controller's FIFO overran: at least this many frames were lost.
     pub lost_controller: u64,
@@ -350,7 +350,11 @@ fn on_event(
                 LossStage::Controller => counters.lost_controller += u64::from(count),
                 LossStage::Queue => counters.lost_queue += u64::from(count),
                 LossStage::Link => counters.lost_link += u64::from(count),
-                LossStage::Host => counters.lost_host += u64::from(count),
+                // A server of a shared board had them, and this client was too slow.
+                LossStage::Host => {
+                    counters.received += u64::from(count);
+                    counters.lost_host += u64::from(count);
+                }
             }
             (channel, TraceEvent::Lost { stage: Some(stage), count, at_least })
         }

@@ -2,7 +2,7 @@
 
 use cantap_wire::message::{
     ChannelConfig, ChannelStatus, Checksum, Defaults, Failures, Filter, FrameKind, Modifier, Periodic,
-    RegisterSet, Registers, Status, Trigger, TxFrame, capability,
+    RegisterSet, Registers, Role, Status, Trigger, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Hello, Refusal, Reply};
@@ -224,5 +224,9 @@ pub fn refusals() -> Vec<(Refusal, &'static str)> {
         (Refusal::Hardware, "11"),
         (Refusal::NothingSaved, "12"),
         (Refusal::NotBusOff, "13"),
+        (Refusal::NotGranted { needs: Role::Send }, "14 02"),
+        (Refusal::Held, "15"),
+        (Refusal::OtherSettings, "16"),
+        (Refusal::NoBoard, "17"),
     ]
 }

@@ -267,6 +267,7 @@ fn sentence(refusal: Refusal) -> String {
         }
         Refusal::NothingSaved => "nothing is saved on it; give the bit rate, or save a configuration first",
         Refusal::NotBusOff => "the channel is not bus-off; there is nothing to recover from",
+        Refusal::NotMeasuring => "no receive pin is watched; begin the measurement first",
     };
     fixed.to_owned()
 }

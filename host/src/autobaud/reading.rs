@@ -66,7 +66,7 @@ fn read_frame(edges: &[PinEdge], start: usize, bit_ticks: f64) -> Option<(ReadFr
     if !first.dominant || !start.checked_sub(1).is_none_or(|before| idle(&edges[before])) {
         return None;
     }
-    let mut bits = Bits::default();
+    let mut bits = Parser::default();
     let mut placed = vec![PlacedEdge { bit: 0, edge: first }];
     let (mut bit, mut falling) = (0, first);
     let mut at = start;
@@ -133,14 +133,14 @@ enum Step {
 
 /// A frame's bits as they come.
 #[derive(Default)]
-struct Bits {
+struct Parser {
     /// Without stuff bits; true for recessive.
     bits: Vec<bool>,
     last: Option<bool>,
     run: u32,
 }
 
-impl Bits {
+impl Parser {
     /// Takes a bit; `None` if there is no such frame.
     fn push(&mut self, recessive: bool) -> Option<Step> {
         let same = self.last == Some(recessive);

@@ -9,7 +9,7 @@ use cantap::device::Link;
 use cantap::{Channel, Device};
 use cantap_sim::address::Address;
 
-use super::Extent;
+use super::extent::Extent;
 use crate::board::Board;
 
 /// The bus's rate as it is asked for, and what it must be called; nothing where the controller's clock does not reach it.
@@ -61,7 +61,7 @@ pub fn run(extent: &Extent) -> Result<()> {
         if !extent.wants(&bitrate.to_string()) {
             continue;
         }
-        let mut line = format!("{bitrate:<10} ");
+        let mut cells = Vec::new();
         for (_, density) in DENSITIES {
             let mut told = Vec::new();
             for errors in DAMAGE {
@@ -78,9 +78,9 @@ pub fn run(extent: &Extent) -> Result<()> {
                 sum.right += cell.right;
                 sum.farthest = sum.farthest.max(cell.farthest);
             }
-            line += &format!("{:>30}", told.join(" / "));
+            cells.push(format!("{:>30}", told.join(" / ")));
         }
-        println!("{line}");
+        println!("{bitrate:<10} {}", cells.concat());
     }
     for (name, sum) in [("undisturbed", all), ("30 % destroyed", damaged)] {
         let (right, runs, off) = (sum.right, sum.runs, 100.0 * sum.farthest);

@@ -2,9 +2,9 @@
 
 use std::collections::VecDeque;
 
-use super::node::BitTime;
 use super::bits::FrameBits;
-use super::outcome::{FLAG, Outcome, Participant};
+use super::node::BitTime;
+use super::outcome::{FLAG, FrameEnd, Participant};
 
 /// A change of the bus's level.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -53,7 +53,7 @@ impl Waveform {
         bit: BitTime,
         bits: &FrameBits,
         participants: &[Participant],
-        outcome: &Outcome,
+        outcome: &FrameEnd,
     ) {
         for (n, dominant) in levels(bits, participants, outcome).enumerate() {
             let at = start + bit.cycles(n as u64);
@@ -72,7 +72,7 @@ impl Waveform {
 fn levels<'a>(
     bits: &'a FrameBits,
     participants: &'a [Participant],
-    outcome: &'a Outcome,
+    outcome: &'a FrameEnd,
 ) -> impl Iterator<Item = bool> + use<'a> {
     let given_up = outcome.of_participant(0).map_or(bits.len(), |detection| detection.bit + 1);
     let flags = move |n: usize| {
@@ -93,7 +93,7 @@ mod tests {
 
     const BIT: u64 = 144;
 
-    fn wave(outcome: &Outcome, participants: &[Participant], slow_recessive: u64) -> Vec<(u64, bool)> {
+    fn wave(outcome: &FrameEnd, participants: &[Participant], slow_recessive: u64) -> Vec<(u64, bool)> {
         let bits = FrameBits::new(&"123#1122".parse().unwrap());
         let mut wave = Waveform { slow_recessive, ..Waveform::default() };
         wave.frame(1000, BitTime::of_cycles(BIT), &bits, participants, outcome);
@@ -107,7 +107,7 @@ mod tests {
     fn a_frame_s_edges_are_its_bits_with_the_acknowledgement() {
         let bits = FrameBits::new(&"123#1122".parse().unwrap());
         let participants = [SENDER, RECEIVER];
-        let outcome = Outcome::of(&bits, &participants, None);
+        let outcome = FrameEnd::of(&bits, &participants, None);
         let mut expected = bits.levels().to_vec();
         expected[bits.ack_slot()] = false;
         let edges = wave(&outcome, &participants, 10);
@@ -126,7 +126,7 @@ mod tests {
         let bits = FrameBits::new(&"123#1122".parse().unwrap());
         let confused = Participant { own: Some((20, BusErrorKind::Stuff)), ..RECEIVER };
         let participants = [SENDER, confused];
-        let outcome = Outcome::of(&bits, &participants, None);
+        let outcome = FrameEnd::of(&bits, &participants, None);
         let edges = wave(&outcome, &participants, 0);
         let (last, dominant) = edges[edges.len() - 1];
         assert!(!dominant);

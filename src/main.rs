@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | 5 | both channels' receive and transmit interrupts: the stamp, and nothing else | a late stamp is a wrong one |
 //! | 4 | draining both FIFOs, confirming, error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
+//! | 3 | a receive pin that is measured | USB would blur it, and capture must not wait |
 //! | 2 | USB, the millisecond tick | a host can be made to wait |
 //! | – | idle | sleeps |
 //!
@@ -41,6 +42,7 @@ mod app {
 
     use crate::hw::access::{Access, Controls, Tap};
     use crate::hw::can::Bells;
+    use crate::hw::edges::EdgeCatcher;
     use crate::hw::stamp::StampTimer;
     use crate::hw::tick::Tick;
     use crate::hw::usb::{Memory, UsbPort};
@@ -53,6 +55,8 @@ mod app {
         tap: Tap,
         /// To be read at any priority.
         stamp: StampTimer,
+        /// Takes down edges of the receive pin that is measured.
+        catcher: EdgeCatcher,
         /// The switches of CAN1's interrupts.
         can1_bells: Bells<0>,
         /// The switches of CAN2's interrupts.
@@ -91,6 +95,8 @@ mod app {
             sof,
             tick,
             crc,
+            meter,
+            catcher,
             usb,
             mut chip,
             watchdog,
@@ -107,6 +113,7 @@ mod app {
             Shared {
                 tap: Tap { capture: Capture::new(producer), traffic: can.traffic, alarm },
                 stamp,
+                catcher,
                 can1_bells,
                 can2_bells,
                 can1_entered: AtomicU32::new(0),
@@ -115,7 +122,7 @@ mod app {
                 can2_sent_at: AtomicU32::new(0),
                 session: Session::new(consumer, identity),
                 usb,
-                controls: Controls { can: can.control, filters, chip, stamp, sof, crc },
+                controls: Controls { can: can.control, filters, chip, stamp, sof, crc, meter },
             },
             Local { tick, watchdog },
         )
@@ -235,6 +242,28 @@ mod app {
             alarm.acknowledge();
             capture.on_alarm(traffic, alarm);
         });
+    }
+
+    /// Takes down the edges of a receive pin that is measured: CAN1's or CAN2's, as the board has them. They never come while its
+    /// controller is on the bus.
+    ///
+    /// Priority 3: above USB, which may wait for the 6 ms that it lasts at most, and below everything that captures or sends. An edge of
+    /// 1 Mbit/s is over after a microsecond: what comes too late is marked, and a frame of it lost to the measurement.
+    #[task(binds = EXTI15_10, priority = 3, shared = [&catcher])]
+    fn exti15_10(cx: exti15_10::Context) {
+        cx.shared.catcher.catch();
+    }
+
+    /// As [`exti15_10`], for a pin of the lines 5 to 9.
+    #[task(binds = EXTI9_5, priority = 3, shared = [&catcher])]
+    fn exti9_5(cx: exti9_5::Context) {
+        cx.shared.catcher.catch();
+    }
+
+    /// As [`exti15_10`], for a pin of line 0.
+    #[task(binds = EXTI0, priority = 3, shared = [&catcher])]
+    fn exti0(cx: exti0::Context) {
+        cx.shared.catcher.catch();
     }
 
     /// Talks to the host.

@@ -104,6 +104,31 @@ pub trait FilterBanks {
     fn write(&mut self, layout: &Layout);
 }
 
+/// A change of a receive pin's level.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PinEdge {
+    /// The stamp timer when it came.
+    pub at: u32,
+    /// The level behind it: dominant, or recessive.
+    pub dominant: bool,
+    /// The meter was blind for a moment just before: edges may be missing, and this one may have been earlier.
+    pub unsure: bool,
+}
+
+/// Measures when a channel's receive pin changes, whatever the bit rate. It only listens, and never at the cost of capture: what it misses
+/// is marked.
+pub trait EdgeMeter {
+    /// Forgets what was measured, and watches this channel's pin from now on; `None` for none.
+    fn watch(&mut self, channel: Option<cantap_wire::Channel>);
+    /// Takes the oldest edge. A meter keeps [`EDGES_KEPT`]; when they are full, it is blind until all of them are taken.
+    fn next(&mut self) -> Option<PinEdge>;
+    /// The level of the pin that is watched; false if none is.
+    fn is_dominant(&self) -> bool;
+}
+
+/// Edges that a meter keeps: those of two of the longest frames.
+pub const EDGES_KEPT: usize = 256;
+
 /// The chip itself.
 pub trait Chip {
     /// Temperature in 0.1 °C, if it can be measured.

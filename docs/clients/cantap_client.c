@@ -17,14 +17,14 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PROTOCOL = 3, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
+enum { PROTOCOL = 4, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
 
 static const char *const REPLIES[] = {"Hello", "Done", "Opened", "Status", "Time", "Filters", "Queued", "Registers", "Defaults",
-                                      "Failures"};
+                                      "Failures", "Edges"};
 static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Unsupported", "BadTiming", "BadId", "BadDlc",
                                        "BadTag", "BadEntry", "BadSlot", "ChannelOpen", "ChannelClosed", "ListenOnly", "QueueFull",
                                        "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff",
-                                       "NotGranted", "Held", "OtherSettings", "NoBoard"};
+                                       "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard"};
 static const char *const STAGES[] = {"controller", "queue", "link", "host"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};

@@ -169,7 +169,10 @@ impl Served {
             return;
         }
         for channel in Channel::ALL {
-            let bit = self.rig.bit_cycles(channel);
+            // A pin that is measured needs something to be measured.
+            let watched =
+                self.rig.watches(channel).then(|| BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK).cycles(1));
+            let bit = self.rig.bit_cycles(channel).or(watched);
             if bit == self.open[channel.index()] {
                 continue;
             }

@@ -380,6 +380,11 @@ impl Rig {
         controller.listens().then(|| controller.timing().bit())
     }
 
+    /// Whether the firmware watches the edges of a channel's receive pin.
+    pub fn watches(&self, channel: Channel) -> bool {
+        self.machine.board().watches(channel.index())
+    }
+
     /// Whether a channel's controller takes part in its bus, if only as a listener.
     pub fn takes_part(&self, channel: Channel) -> bool {
         self.machine.board().can.controllers[channel.index()].listens()

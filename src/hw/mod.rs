@@ -7,6 +7,7 @@ pub mod chip;
 mod clocks;
 mod copy;
 pub mod crc;
+pub mod edges;
 mod entry;
 mod failure;
 mod flash;
@@ -45,6 +46,10 @@ pub struct Hardware {
     pub tick: tick::Tick,
     /// The CRC unit.
     pub crc: crc::CrcUnit,
+    /// What measures the receive pins.
+    pub meter: edges::PinMeter,
+    /// The same, in the pins' interrupts.
+    pub catcher: edges::EdgeCatcher,
     /// The virtual COM port.
     pub usb: usb::UsbPort,
     /// The chip.
@@ -82,12 +87,15 @@ pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> 
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
     stay_in_reach_of_a_debugger(&device.DBGMCU);
     let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
+    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, alarm.timer(), &mut rcc);
     Hardware {
         can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc),
         sof: sof::SofLatch::start(alarm.timer()),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),
+        meter,
+        catcher,
         usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),
         chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), leds),
         watchdog,

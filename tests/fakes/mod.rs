@@ -13,7 +13,7 @@ use cantap_firmware::port::board::Board;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::Session;
 use cantap_firmware::ports::{
-    Chip, Clock, Control, ErrorStatus, FilterBanks, Outcome, PACKET, Port, Traffic,
+    Chip, Clock, Control, EdgeMeter, ErrorStatus, FilterBanks, Outcome, PACKET, PinEdge, Port, Traffic,
 };
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{ChannelConfig, EndReason, Failures, Mode, RegisterSet};
@@ -283,6 +283,30 @@ impl Port for FakePort {
     }
 }
 
+/// A meter whose edges a test puts there.
+#[derive(Default)]
+pub struct FakeMeter {
+    /// How it was told what to watch.
+    pub watched: Vec<Option<Channel>>,
+    pub edges: VecDeque<PinEdge>,
+    pub dominant: bool,
+}
+
+impl EdgeMeter for FakeMeter {
+    fn watch(&mut self, channel: Option<Channel>) {
+        self.watched.push(channel);
+        self.edges.clear();
+    }
+
+    fn next(&mut self) -> Option<PinEdge> {
+        self.edges.pop_front()
+    }
+
+    fn is_dominant(&self) -> bool {
+        self.dominant
+    }
+}
+
 pub struct FakeBoard<'q, const N: usize> {
     pub capture: Capture<'q, N>,
     pub traffic: [FakeTraffic; CHANNELS],
@@ -292,6 +316,7 @@ pub struct FakeBoard<'q, const N: usize> {
     pub chip: FakeChip,
     /// What the next reading of the SOF latch finds.
     pub sof: Option<SofReading>,
+    pub meter: FakeMeter,
 }
 
 impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
@@ -300,6 +325,7 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
     type Clock = FakeClock;
     type Filters = FakeFilters;
     type Chip = FakeChip;
+    type Meter = FakeMeter;
 
     fn with_capture<R>(
         &mut self,
@@ -326,6 +352,10 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
 
     fn chip(&mut self) -> &mut FakeChip {
         &mut self.chip
+    }
+
+    fn meter(&mut self) -> &mut FakeMeter {
+        &mut self.meter
     }
 }
 
@@ -359,6 +389,7 @@ impl<'q, const N: usize> Bench<'q, N> {
                 filters: FakeFilters::default(),
                 chip: FakeChip::default(),
                 sof: None,
+                meter: FakeMeter::default(),
             },
             session: Session::new(consumer, identity),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },

@@ -273,6 +273,7 @@ fn sentence(refusal: Refusal) -> String {
         }
         Refusal::NothingSaved => "nothing is saved on it; give the bit rate, or save a configuration first",
         Refusal::NotBusOff => "the channel is not bus-off; there is nothing to recover from",
+        Refusal::NotMeasuring => "no receive pin is watched; begin the measurement first",
         Refusal::NotGranted { needs } => {
             return format!("its server does not let this client do that, which needs the right to {needs}");
         }

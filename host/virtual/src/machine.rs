@@ -18,6 +18,7 @@ use super::board::{
 };
 use super::car;
 use super::controller::{ControlSide, Controller, TrafficSide};
+use super::edges::VirtualMeter;
 use super::flash::Flash;
 use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
@@ -123,6 +124,7 @@ impl<'q> Machine<'q> {
                 clock: ModelClock::started_at(now_ns, crystal_ppm),
                 filters: Filters([side(0), side(1)]),
                 chip: VirtualChip { flash, ending: None },
+                meter: VirtualMeter::default(),
             },
             session: Session::new(consumer, identity),
             port,
@@ -205,6 +207,7 @@ impl<'q> Machine<'q> {
         for index in 0..2 * CHANNELS {
             self.with_bus(index, |bus, nodes| bus.step(now_ns, nodes));
         }
+        self.pass_edges();
         self.interrupt();
         if self.board.clock.alarm_ns() <= now_ns {
             self.board.clock.clear_alarm();
@@ -223,6 +226,17 @@ impl<'q> Machine<'q> {
             self.next_usb_ns += MS_NS / u64::from(USB_POLLS_PER_MS);
             self.port.allow(USB_POLLS_PER_MS);
             self.session.poll(&mut self.port, &mut self.board);
+        }
+    }
+
+    /// Lets the meter see the edges of the pin that it watches.
+    fn pass_edges(&mut self) {
+        let watched = self.board.meter.watched().map(|channel| if self.joined { 0 } else { channel.index() });
+        for (index, bus) in self.buses.iter_mut().enumerate() {
+            bus.watch(watched == Some(index));
+            while let Some(edge) = bus.pass_edge(self.now_ns) {
+                self.board.meter.edge(self.board.clock.ticks_at(edge.at_ns) as u32, edge.dominant);
+            }
         }
     }
 

@@ -32,10 +32,11 @@ mod app {
     use cantap_firmware::bus::capture::Capture;
     use cantap_firmware::bus::filters::Layout;
     use cantap_firmware::bus::queue::RecordQueue;
+    use cantap_firmware::bus::transmit::TxQueue;
     use cantap_firmware::lights::Activity;
-    use cantap_firmware::port::session::Session;
+    use cantap_firmware::port::session::{self, Session};
     use cantap_firmware::ports::FilterBanks;
-    use cantap_wire::Channel;
+    use cantap_wire::{CHANNELS, Channel};
 
     use stm32f4xx_hal::pac::Interrupt;
 
@@ -82,9 +83,16 @@ mod app {
         watchdog: Watchdog,
     }
 
-    #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
+    // What is large is made here, in its place: a value that `init` returned would pass over the stack.
+    #[init(local = [
+        records: RecordQueue = RecordQueue::new(),
+        tx_memory: [TxQueue; CHANNELS] = [const { TxQueue::new() }; CHANNELS],
+        session_memory: session::Memory = session::Memory::new(),
+        usb_memory: Memory = Memory::new(),
+    ])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let hardware = hw::start(cx.device, cx.local.usb_memory);
+        let init::LocalResources { records, tx_memory, session_memory, usb_memory, .. } = cx.local;
+        let hardware = hw::start(cx.device, usb_memory);
         let Hardware {
             can,
             alarm,
@@ -102,10 +110,10 @@ mod app {
         let stamp = alarm.timer();
         let mut filters = can.filters;
         filters.write(&Layout::open());
-        let (producer, consumer) = cx.local.records.split();
+        let (producer, consumer) = records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, alarm },
+                tap: Tap { capture: Capture::new(producer, tx_memory), traffic: can.traffic, alarm },
                 stamp,
                 can1_bells,
                 can2_bells,
@@ -113,7 +121,7 @@ mod app {
                 can2_entered: AtomicU32::new(0),
                 can1_sent_at: AtomicU32::new(0),
                 can2_sent_at: AtomicU32::new(0),
-                session: Session::new(consumer, identity),
+                session: Session::new(consumer, identity, session_memory),
                 usb,
                 controls: Controls { can: can.control, filters, chip, stamp, sof, crc },
             },

@@ -100,8 +100,9 @@ pub trait Control {
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
     /// Writes what of the banks differs from the layout, as they are now. Reception is interrupted, so no channel may be open unless
-    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ.
-    fn write(&mut self, layout: &Layout);
+    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ. Returns whether anything
+    /// differed.
+    fn write(&mut self, layout: &Layout) -> bool;
 }
 
 /// The chip itself.

@@ -15,7 +15,7 @@ use crate::bus::queue::Producer;
 use crate::bus::recorder::Recorder;
 use crate::bus::sof::SofMark;
 use crate::bus::time::NEVER;
-use crate::bus::transmit::Transmitter;
+use crate::bus::transmit::{Transmitter, TxQueue};
 use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 
@@ -23,41 +23,41 @@ use crate::ports::{Clock, Traffic};
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
 
 /// One channel's state.
-struct ChannelState {
+struct ChannelState<'q> {
     open: Option<ChannelConfig>,
     /// Why its transmissions are aborted, if they are.
     abort_reason: TransmitFailure,
     frames: u32,
     overruns: u32,
     errors: ErrorMonitor,
-    transmitter: Transmitter,
+    transmitter: Transmitter<'q>,
 }
 
 /// Everything the tasks of priority 4 share.
 pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     recorder: Recorder<'q, N>,
-    channels: [ChannelState; CHANNELS],
+    channels: [ChannelState<'q>; CHANNELS],
     /// Per channel, frames and mishaps at the last [`Self::take_activity`].
     seen: [(u32, u32); CHANNELS],
 }
 
 impl<'q, const N: usize> Capture<'q, N> {
-    /// Both channels closed.
-    #[expect(clippy::large_stack_arrays, reason = "built once, at start, into its static place")]
-    pub const fn new(producer: Producer<'q, N>) -> Self {
-        const fn state(channel: Channel) -> ChannelState {
+    /// Both channels closed, with the memory of their queues.
+    pub const fn new(producer: Producer<'q, N>, queues: &'q mut [TxQueue; CHANNELS]) -> Self {
+        const fn state(channel: Channel, queue: &mut TxQueue) -> ChannelState<'_> {
             ChannelState {
                 open: None,
                 abort_reason: TransmitFailure::Aborted,
                 frames: 0,
                 overruns: 0,
                 errors: ErrorMonitor::new(channel),
-                transmitter: Transmitter::new(channel),
+                transmitter: Transmitter::new(channel, queue),
             }
         }
+        let [first, second] = queues;
         Self {
             recorder: Recorder::new(producer),
-            channels: [state(Channel::Can1), state(Channel::Can2)],
+            channels: [state(Channel::Can1, first), state(Channel::Can2, second)],
             seen: [(0, 0); CHANNELS],
         }
     }
@@ -257,7 +257,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait.
     fn give_up_when_off(
-        state: &mut ChannelState,
+        state: &mut ChannelState<'_>,
         traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
@@ -274,7 +274,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// When something is due on each open channel; [`NEVER`] on the others.
     #[inline]
-    fn due(&self, of: impl Fn(&Transmitter) -> u64) -> [u64; CHANNELS] {
+    fn due(&self, of: impl Fn(&Transmitter<'q>) -> u64) -> [u64; CHANNELS] {
         self.channels
             .each_ref()
             .map(|state| if state.open.is_some() { of(&state.transmitter) } else { NEVER })
@@ -320,6 +320,13 @@ impl<'q, const N: usize> Capture<'q, N> {
         state.abort_reason = TransmitFailure::Aborted;
         state.errors.restart();
         self.recorder.event(&Event::Started { channel }, now);
+    }
+
+    /// The channel's filters let nothing pass for a moment. What came then is not even counted by the controller.
+    pub fn was_deaf(&mut self, channel: Channel, clock: &impl Clock) {
+        let now = self.now(clock);
+        let lost = Event::Lost { channel, stage: LossStage::Controller, count: 0, at_least: true };
+        self.recorder.event(&lost, now);
     }
 
     /// First half of closing: gives up transmissions. The channel is still on the bus.
@@ -386,7 +393,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// The channel's transmissions; call [`Self::kick`] afterwards.
-    pub const fn transmitter(&mut self, channel: Channel) -> &mut Transmitter {
+    pub const fn transmitter(&mut self, channel: Channel) -> &mut Transmitter<'q> {
         &mut self.channels[channel.index()].transmitter
     }
 

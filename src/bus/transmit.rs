@@ -40,10 +40,26 @@ struct TriggerState {
     waiting: bool,
 }
 
+/// The memory of a channel's queue: eight kilobytes, which are made where they stay and never pass over a stack.
+pub struct TxQueue(Deque<Queued, TX_QUEUE>);
+
+impl TxQueue {
+    /// Nothing in it.
+    pub const fn new() -> Self {
+        Self(Deque::new())
+    }
+}
+
+impl Default for TxQueue {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 /// One channel's transmissions.
-pub struct Transmitter {
+pub struct Transmitter<'q> {
     channel: Channel,
-    queue: Deque<Queued, TX_QUEUE>,
+    queue: &'q mut Deque<Queued, TX_QUEUE>,
     mailboxes: Mailboxes,
     periodic: PeriodicTable,
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
@@ -60,12 +76,12 @@ pub struct Transmitter {
     failed: u32,
 }
 
-impl Transmitter {
-    /// Nothing to send.
-    pub const fn new(channel: Channel) -> Self {
+impl<'q> Transmitter<'q> {
+    /// Nothing to send; `queue` is empty.
+    pub const fn new(channel: Channel, queue: &'q mut TxQueue) -> Self {
         Self {
             channel,
-            queue: Deque::new(),
+            queue: &mut queue.0,
             mailboxes: Mailboxes::new(),
             periodic: PeriodicTable::new(channel),
             triggers: [const { None }; TRIGGER_SLOTS],

@@ -443,7 +443,7 @@ pub struct CanFilters {
 }
 
 impl FilterBanks for CanFilters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
         let can = &self.can1;
         let bits = |is: fn(Shape) -> bool| {
             let bit = |(number, bank): (usize, &Option<_>)| {
@@ -476,12 +476,14 @@ impl FilterBanks for CanFilters {
             // SAFETY: as above; all banks lead to FIFO 0.
             can.ffa1r().write(|w| unsafe { w.bits(0) });
         }
+        let mut differed = reshaped;
         for (number, bank) in layout.banks.iter().enumerate().take(BANKS) {
             let Some(bank) = bank else { continue };
             let registers = can.fb(number);
             if registers.fr1().read().bits() == bank.first && registers.fr2().read().bits() == bank.second {
                 continue;
             }
+            differed = true;
             // A bank can only be written while it is off.
             // SAFETY: one bit for each of the 28 banks, no others.
             can.fa1r().modify(|r, w| unsafe { w.bits(r.bits() & !(1 << number)) });
@@ -497,5 +499,6 @@ impl FilterBanks for CanFilters {
             can.fa1r().write(|w| unsafe { w.bits(active) });
             can.fmr().modify(|_, w| w.finit().clear_bit());
         }
+        differed
     }
 }

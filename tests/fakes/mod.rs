@@ -183,11 +183,15 @@ impl Control for FakeControl {
 #[derive(Default)]
 pub struct FakeFilters {
     pub written: Vec<Layout>,
+    /// A controller's reset has cleared the banks.
+    pub cleared: bool,
 }
 
 impl FilterBanks for FakeFilters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
+        let differed = std::mem::take(&mut self.cleared) || self.written.last() != Some(layout);
         self.written.push(layout.clone());
+        differed
     }
 }
 
@@ -352,7 +356,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
         Bench {
             board: FakeBoard {
-                capture: Capture::new(producer),
+                capture: Capture::new(producer, Box::leak(Default::default())),
                 traffic: Default::default(),
                 control: Default::default(),
                 clock: FakeClock::default(),
@@ -360,7 +364,7 @@ impl<'q, const N: usize> Bench<'q, N> {
                 chip: FakeChip::default(),
                 sof: None,
             },
-            session: Session::new(consumer, identity),
+            session: Session::new(consumer, identity, Box::leak(Default::default())),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
             decoder: Decoder::new(),
             records: Vec::new(),

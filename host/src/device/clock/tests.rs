@@ -314,7 +314,8 @@ fn devices_on_two_controllers_are_not_put_on_one_clock() {
 fn a_bad_beginning_does_not_put_two_devices_on_two_controllers() {
     let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
     let map = |ppm: f64, busy_s: i64| {
-        let delays = move |second: i64| if second < busy_s { (100_000, 20_000_000) } else { (100_000, 200_000) };
+        let delays =
+            move |second: i64| if second < busy_s { (100_000, 20_000_000) } else { (100_000, 200_000) };
         follow(&Simulated { ppm, ..controller }, 200, delays, all_marks).0
     };
     let (first, second) = (map(40.0, 0), map(-40.0, 5));
@@ -340,7 +341,8 @@ fn a_time_that_is_wrong_once_is_counted_and_decides_nothing() {
     }
     let common = CommonClock::between(&here, &there).unwrap();
     assert_eq!(common.outliers(), 3, "{common:?}");
-    let mapped = |common: CommonClock| common.to_second(here.frames(), here.ticks(utc(200 * S)), there.frames());
+    let mapped =
+        |common: CommonClock| common.to_second(here.frames(), here.ticks(utc(200 * S)), there.frames());
     assert_eq!(mapped(common), mapped(quiet));
     assert!(common.disagreement_ns() >= 4_000_000, "{common:?}: not hidden");
 }

@@ -24,6 +24,8 @@ mod signals;
 #[cfg(feature = "bench")]
 mod stats;
 #[cfg(feature = "bench")]
+mod tasks;
+#[cfg(feature = "bench")]
 mod wire;
 
 use anyhow::Result;

@@ -356,7 +356,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
         Bench {
             board: FakeBoard {
-                capture: Capture::new(producer, Box::leak(Default::default())),
+                capture: Capture::new(producer, Box::leak(Box::default())),
                 traffic: Default::default(),
                 control: Default::default(),
                 clock: FakeClock::default(),
@@ -364,7 +364,7 @@ impl<'q, const N: usize> Bench<'q, N> {
                 chip: FakeChip::default(),
                 sof: None,
             },
-            session: Session::new(consumer, identity, Box::leak(Default::default())),
+            session: Session::new(consumer, identity, Box::leak(Box::default())),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
             decoder: Decoder::new(),
             records: Vec::new(),

@@ -34,6 +34,15 @@ struct Queued {
     at: u64,
 }
 
+/// A transmission that has ended.
+struct Ended {
+    tag: u32,
+    frame: Frame,
+    /// `None`: it was sent.
+    failure: Option<TransmitFailure>,
+    at: u64,
+}
+
 struct TriggerState {
     entry: Trigger,
     left: Option<u32>,
@@ -67,7 +76,7 @@ pub struct Transmitter<'q> {
     replies_waiting: u8,
     /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
     /// is sent until it is written; what was in the mailboxes by then has room here too.
-    unconfirmed: Deque<(Event, u64), { 2 * MAILBOXES }>,
+    unconfirmed: Deque<Ended, { 2 * MAILBOXES }>,
     /// The queue is being given up, as fast as its records find room.
     dropping: Option<TransmitFailure>,
     /// The controller stays off the bus: no mailbox is filled.
@@ -270,21 +279,21 @@ impl<'q> Transmitter<'q> {
         while !self.unconfirmed.is_full() {
             let Some((mailbox, outcome)) = traffic.take_finished() else { break };
             let Some((tag, frame)) = self.mailboxes.take(mailbox) else { continue };
-            let channel = self.channel;
-            let failed = |reason| Event::TransmitFailed { channel, tag, reason };
-            let event = match outcome {
-                Outcome::Sent => Event::Transmitted { channel, tag, frame },
-                Outcome::ArbitrationLost => failed(TransmitFailure::ArbitrationLost),
-                Outcome::Error => failed(TransmitFailure::BusError),
-                Outcome::Aborted => failed(reason),
+            let failure = match outcome {
+                Outcome::Sent => None,
+                Outcome::ArbitrationLost => Some(TransmitFailure::ArbitrationLost),
+                Outcome::Error => Some(TransmitFailure::BusError),
+                Outcome::Aborted => Some(reason),
             };
-            let counter = if outcome == Outcome::Sent { &mut self.sent } else { &mut self.failed };
+            let counter = if failure.is_none() { &mut self.sent } else { &mut self.failed };
             *counter = counter.wrapping_add(1);
             let at = if first { ended } else { now() };
             first = false;
             // Cannot fail: checked above.
-            let _ = self.unconfirmed.push_back((event, at));
+            let _ = self.unconfirmed.push_back(Ended { tag, frame, failure, at });
         }
+        // Whoever collects: a stamp that stays would be taken for the next one's.
+        traffic.await_finished();
     }
 
     /// Whether something other than the queue's frames is waiting, for [`Self::service`].
@@ -294,7 +303,7 @@ impl<'q> Transmitter<'q> {
     }
 
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
-    fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
+    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
         while self.head_due() <= now
             && let Some(mailbox) = self.prepare_head(traffic, now)
         {
@@ -325,8 +334,13 @@ impl<'q> Transmitter<'q> {
 
     /// Records what has finished, each at its time; false if the queue has no room for all of it.
     pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>) -> bool {
-        while let Some((event, at)) = self.unconfirmed.front() {
-            if !recorder.event(event, *at) {
+        let channel = self.channel;
+        while let Some(&Ended { tag, frame, failure, at }) = self.unconfirmed.front() {
+            let event = match failure {
+                None => Event::Transmitted { channel, tag, frame },
+                Some(reason) => Event::TransmitFailed { channel, tag, reason },
+            };
+            if !recorder.event(&event, at) {
                 return false;
             }
             self.unconfirmed.pop_front();
@@ -389,10 +403,10 @@ impl<'q> Transmitter<'q> {
     /// if it has no time.
     #[inline]
     pub fn head_due(&self) -> u64 {
-        match self.queue.front() {
-            Some(head) if !self.mailboxes.are_full() => head.at,
-            _ => NEVER,
+        if self.mailboxes.are_full() {
+            return NEVER;
         }
+        self.queue.front().map_or(NEVER, |head| head.at)
     }
 
     /// When the next periodic entry is due, if its frame can leave then.

@@ -3,7 +3,7 @@
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
 //! Runs below the tasks of priority 4, in the USB interrupt and the millisecond tick; nothing waits.
 
-use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal};
+use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal_with};
 use cantap_wire::message::{EndReason, read_send, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request};
 
@@ -298,8 +298,9 @@ impl<'q, const N: usize> Session<'q, N> {
 
     fn handle_request(&mut self, greeted: bool, board: &mut impl Board<'q, N>) -> bool {
         let Self { inbox, request, .. } = self;
-        let taken = inbox
-            .take_until(0, MAX_REQUEST_ENCODED, |encoded| unseal(encoded, &mut request[..]).map(<[u8]>::len));
+        let taken = inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| {
+            unseal_with(encoded, &mut request[..], |message| board.crc32(message)).map(<[u8]>::len)
+        });
         let Some(len) = taken else { return false };
         let Some(Ok(len)) = len else {
             // Damaged: there is no telling whom to answer.

@@ -438,7 +438,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// The transmit interrupt.
     fn transmit_interrupt(&mut self, channel: Channel) {
         let entered = self.board.clock.now();
-        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, entered);
+        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, Some(entered));
     }
 
     /// A millisecond passes. Mailboxes that were given up have reported that meanwhile.

@@ -299,14 +299,14 @@ impl<'q> Rig<'q> {
     fn await_answer(&mut self, command: Command) -> Result<Option<Response>, TestCaseError> {
         self.reads = true;
         self.answers.clear();
-        let (what, lives) = (format!("{command:?}"), self.lives);
+        let (what, lives_left) = (format!("{command:?}"), self.memories.len());
         let id = self.ask(command);
         for _ in 0..PATIENCE_MS {
             self.step();
             if let Some(at) = self.answers.iter().position(|answer| answer.id == id) {
                 return Ok(Some(self.answers.swap_remove(at)));
             }
-            if self.lives != lives {
+            if self.memories.len() != lives_left {
                 return Ok(None);
             }
         }

@@ -247,7 +247,7 @@ impl<'q> Machine<'q> {
                 board.capture.on_receive(channel, &mut board.traffic[index], &board.clock, entered);
             }
             if interrupts.transmit {
-                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, entered);
+                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, Some(entered));
             }
             if interrupts.error {
                 board.capture.on_error(channel, &mut board.traffic[index], entered);

@@ -33,10 +33,11 @@ mod app {
     use cantap_firmware::bus::capture::Capture;
     use cantap_firmware::bus::filters::Layout;
     use cantap_firmware::bus::queue::RecordQueue;
+    use cantap_firmware::bus::transmit::TxQueue;
     use cantap_firmware::lights::Activity;
-    use cantap_firmware::port::session::Session;
-    use cantap_firmware::ports::FilterBanks;
-    use cantap_wire::Channel;
+    use cantap_firmware::port::session::{self, Session};
+    use cantap_firmware::ports::{FilterBanks, Traffic};
+    use cantap_wire::{CHANNELS, Channel};
 
     use stm32f4xx_hal::pac::Interrupt;
 
@@ -66,9 +67,9 @@ mod app {
         /// When the interrupt stamped CAN2's last frame.
         can2_entered: AtomicU32,
         /// When the interrupt stamped CAN1's last transmission.
-        can1_sent_at: AtomicU32,
+        can1_sent_at: &'static AtomicU32,
         /// When the interrupt stamped CAN2's last transmission.
-        can2_sent_at: AtomicU32,
+        can2_sent_at: &'static AtomicU32,
         /// Only at priority 2.
         #[lock_free]
         session: Session<'static>,
@@ -86,9 +87,19 @@ mod app {
         watchdog: Watchdog,
     }
 
-    #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
+    // What is large is made here, in its place: a value that `init` returned would pass over the stack.
+    #[init(local = [
+        records: RecordQueue = RecordQueue::new(),
+        tx_memory: [TxQueue; CHANNELS] = [const { TxQueue::new() }; CHANNELS],
+        session_memory: session::Memory = session::Memory::new(),
+        usb_memory: Memory = Memory::new(),
+        sent_at: [AtomicU32; CHANNELS] = [const { AtomicU32::new(0) }; CHANNELS],
+    ])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let hardware = hw::start(cx.device, cx.local.usb_memory);
+        let init::LocalResources { records, tx_memory, session_memory, usb_memory, sent_at, .. } = cx.local;
+        let sent_at: &'static [AtomicU32; CHANNELS] = sent_at;
+        let [can1_sent_at, can2_sent_at] = sent_at;
+        let hardware = hw::start(cx.device, usb_memory, sent_at);
         let Hardware {
             can,
             alarm,
@@ -108,19 +119,19 @@ mod app {
         let stamp = alarm.timer();
         let mut filters = can.filters;
         filters.write(&Layout::open());
-        let (producer, consumer) = cx.local.records.split();
+        let (producer, consumer) = records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, alarm },
+                tap: Tap { capture: Capture::new(producer, tx_memory), traffic: can.traffic, alarm },
                 stamp,
                 catcher,
                 can1_bells,
                 can2_bells,
                 can1_entered: AtomicU32::new(0),
                 can2_entered: AtomicU32::new(0),
-                can1_sent_at: AtomicU32::new(0),
-                can2_sent_at: AtomicU32::new(0),
-                session: Session::new(consumer, identity),
+                can1_sent_at,
+                can2_sent_at,
+                session: Session::new(consumer, identity, session_memory),
                 usb,
                 controls: Controls { can: can.control, filters, chip, stamp, sof, crc, meter },
             },
@@ -192,24 +203,23 @@ mod app {
     /// Fills CAN1's mailboxes again and confirms what was sent. USART2 is not used, and its interrupt raises this task.
     ///
     /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
-    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
-    #[task(binds = USART2, priority = 4, shared = [tap, &can1_bells, &can1_sent_at])]
+    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause. A transmission that ends before this has emptied the mailboxes
+    /// is stamped when it is found.
+    #[task(binds = USART2, priority = 4, shared = [tap])]
     fn can1_sent(mut cx: can1_sent::Context) {
-        let entered = cx.shared.can1_sent_at.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            let entered = traffic[0].stamped();
             capture.on_transmit(Channel::Can1, traffic, alarm, entered);
         });
-        cx.shared.can1_bells.open_transmit();
     }
 
     /// As [`can1_sent`], for CAN2, with USART3.
-    #[task(binds = USART3, priority = 4, shared = [tap, &can2_bells, &can2_sent_at])]
+    #[task(binds = USART3, priority = 4, shared = [tap])]
     fn can2_sent(mut cx: can2_sent::Context) {
-        let entered = cx.shared.can2_sent_at.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            let entered = traffic[1].stamped();
             capture.on_transmit(Channel::Can2, traffic, alarm, entered);
         });
-        cx.shared.can2_bells.open_transmit();
     }
 
     /// Records CAN1's errors and changes of state.

@@ -69,6 +69,13 @@ pub trait Traffic {
     /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
     /// leave in the order of these calls.
     fn request(&mut self, mailbox: u8);
+    /// When the transmit interrupt stamped the first of the transmissions that have finished and were not taken; `None` if there are
+    /// none, or where the interrupt hands its stamp over itself.
+    fn stamped(&self) -> Option<u32> {
+        None
+    }
+    /// Nothing that has finished is left: the interrupt may stamp the next.
+    fn await_finished(&mut self) {}
     /// Takes one finished transmission: its mailbox and how it ended.
     fn take_finished(&mut self) -> Option<(u8, Outcome)>;
     /// Asks for every mailbox to be given up. Those that can still be are reported as
@@ -100,8 +107,9 @@ pub trait Control {
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
     /// Writes what of the banks differs from the layout, as they are now. Reception is interrupted, so no channel may be open unless
-    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ.
-    fn write(&mut self, layout: &Layout);
+    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ. Returns whether anything
+    /// differed.
+    fn write(&mut self, layout: &Layout) -> bool;
 }
 
 /// A change of a receive pin's level.

@@ -76,7 +76,7 @@ fn what_ended_while_the_task_was_kept_waiting_is_not_stamped_early() {
     bench.pass(50 * TICKS_PER_US);
     bench.board.traffic[0].send_one().unwrap();
     let second = bench.board.clock.now.get();
-    bench.board.capture.on_transmit(CAN1, &mut bench.board.traffic, &bench.board.clock, stamp);
+    bench.board.capture.on_transmit(CAN1, &mut bench.board.traffic, &bench.board.clock, Some(stamp));
     flush(&mut bench);
     let sent = |(_, record): &&(u64, Record)| matches!(record, Record::Event(Event::Transmitted { .. }));
     let times: Vec<u64> = bench.records.iter().filter(sent).map(|(at, _)| *at).collect();

@@ -10,7 +10,7 @@ PROTOCOL = 4
 REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
-             "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
+            "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
 NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers behind a refusal
 STAGES = "controller queue link host".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()

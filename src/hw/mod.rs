@@ -21,8 +21,11 @@ pub mod tick;
 pub mod usb;
 pub mod watchdog;
 
+use core::sync::atomic::AtomicU32;
+
 use cantap_firmware::lights;
 use cantap_firmware::port::command::Identity;
+use cantap_wire::CHANNELS;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 
@@ -66,8 +69,12 @@ pub struct Hardware {
 /// §7.1.7.3); what a host's software makes of a device that is back at once is another matter.
 const DISCONNECTED_MS: u32 = 10;
 
-/// Sets the board up. To be called once, first of all.
-pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> Hardware {
+/// Sets the board up. To be called once, first of all. `sent_at` is where the transmit interrupts leave their stamps.
+pub fn start(
+    device: pac::Peripherals,
+    usb_memory: &'static mut usb::Memory,
+    sent_at: &'static [AtomicU32; CHANNELS],
+) -> Hardware {
     let restarted_after_failure = restart::begin(&device.RCC, &device.SYSCFG);
     let found = entry::restore(&device.RCC, &device.SYSCFG, &device.FLASH);
     restart::forget_reset_cause(&device.RCC);
@@ -89,7 +96,7 @@ pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> 
     let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
     let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, alarm.timer(), &mut rcc);
     Hardware {
-        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc),
+        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc, sent_at),
         sof: sof::SofLatch::start(alarm.timer()),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),

@@ -288,12 +288,16 @@ impl Commands {
     ) -> Option<Result<(), Refusal>> {
         let halting = &mut self.halting[channel.index()];
         if !board.control(channel).is_stopped() && waited > STOP_WITHIN_TICKS {
-            *halting = true;
             board.control(channel).halt();
+            // Right behind the reset, because the other channel may hear nothing until then.
+            if !core::mem::replace(halting, true) {
+                self.restore_filters(channel, board);
+            }
         }
+        let halting = &mut self.halting[channel.index()];
         if board.control(channel).is_stopped() {
             if core::mem::take(halting) {
-                board.filters().write(&self.layout);
+                self.restore_filters(channel, board);
             }
             return Some(Ok(()));
         }
@@ -302,6 +306,19 @@ impl Commands {
             *halting = false;
             Err(Refusal::Hardware)
         })
+    }
+
+    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed frames: nobody
+    /// knows how many.
+    fn restore_filters<'q, const N: usize>(&self, channel: Channel, board: &mut impl Board<'q, N>) {
+        if !board.filters().write(&self.layout) {
+            return;
+        }
+        for other in Channel::ALL {
+            if other != channel && board.is_open(other) {
+                board.with_capture(|capture, _, clock| capture.was_deaf(other, clock));
+            }
+        }
     }
 
     /// As [`Self::leave`]; a channel that was open has said its last word too.

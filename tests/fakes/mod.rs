@@ -183,11 +183,15 @@ impl Control for FakeControl {
 #[derive(Default)]
 pub struct FakeFilters {
     pub written: Vec<Layout>,
+    /// A controller's reset has cleared the banks.
+    pub cleared: bool,
 }
 
 impl FilterBanks for FakeFilters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
+        let differed = std::mem::take(&mut self.cleared) || self.written.last() != Some(layout);
         self.written.push(layout.clone());
+        differed
     }
 }
 
@@ -382,7 +386,7 @@ impl<'q, const N: usize> Bench<'q, N> {
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
         Bench {
             board: FakeBoard {
-                capture: Capture::new(producer),
+                capture: Capture::new(producer, Box::leak(Box::default())),
                 traffic: Default::default(),
                 control: Default::default(),
                 clock: FakeClock::default(),
@@ -391,7 +395,7 @@ impl<'q, const N: usize> Bench<'q, N> {
                 sof: None,
                 meter: FakeMeter::default(),
             },
-            session: Session::new(consumer, identity),
+            session: Session::new(consumer, identity, Box::leak(Box::default())),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
             decoder: Decoder::new(),
             records: Vec::new(),
@@ -465,7 +469,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// The transmit interrupt.
     fn transmit_interrupt(&mut self, channel: Channel) {
         let entered = self.board.clock.now();
-        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, entered);
+        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, Some(entered));
     }
 
     /// A millisecond passes. Mailboxes that were given up have reported that meanwhile.

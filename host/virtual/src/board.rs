@@ -177,11 +177,13 @@ impl Chip for VirtualChip {
 pub struct Filters(pub [Rc<RefCell<Controller>>; CHANNELS]);
 
 impl FilterBanks for Filters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
         let (first, second) = layout.banks.split_at(usize::from(layout.split));
+        let mut differed = false;
         for (controller, banks) in self.0.iter().zip([first, second]) {
-            controller.borrow_mut().set_filters(banks.iter().flatten().copied().collect());
+            differed |= controller.borrow_mut().set_filters(banks.iter().flatten().copied().collect());
         }
+        differed
     }
 }
 

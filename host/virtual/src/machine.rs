@@ -7,8 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use cantap_firmware::bus::capture::Capture;
 use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::transmit::TxQueue;
 use cantap_firmware::port::command::Identity;
-use cantap_firmware::port::session::Session;
+use cantap_firmware::port::session::{self, Session};
 use cantap_firmware::ports::Clock;
 use cantap_wire::{CHANNELS, Channel};
 use heapless::String;
@@ -50,6 +51,25 @@ impl Witness {
         let read =
             |counts: &[AtomicU64; CHANNELS]| counts.each_ref().map(|count| count.load(Ordering::Acquire));
         Heard { frames: read(&self.heard), driven: read(&self.driven) }
+    }
+}
+
+/// The memory that the firmware is given at its start.
+pub struct Memory {
+    records: RecordQueue,
+    transmit: [TxQueue; CHANNELS],
+    session: session::Memory,
+}
+
+impl Memory {
+    /// As after power-on.
+    #[expect(clippy::large_stack_arrays, reason = "a computer's stack has room for them")]
+    pub fn new() -> Box<Self> {
+        Box::new(Self {
+            records: RecordQueue::new(),
+            transmit: [const { TxQueue::new() }; CHANNELS],
+            session: session::Memory::new(),
+        })
     }
 }
 
@@ -109,16 +129,17 @@ pub struct Machine<'q> {
 }
 
 impl<'q> Machine<'q> {
-    /// The firmware starts, with an empty queue and nothing open.
-    pub fn power_up(queue: &'q RecordQueue, world: World) -> Self {
+    /// The firmware starts in new memory, with nothing open.
+    pub fn power_up(memory: &'q mut Memory, world: World) -> Self {
         let World { port, buses, loops, joined, witness, flash, serial, name, crystal_ppm, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
-        let (producer, consumer) = queue.split();
+        let Memory { records, transmit, session } = memory;
+        let (producer, consumer) = records.split();
         let identity = Identity { board: name, serial: serial.clone() };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {
             board: VirtualBoard {
-                capture: Capture::new(producer),
+                capture: Capture::new(producer, transmit),
                 traffic: [TrafficSide(side(0)), TrafficSide(side(1))],
                 control: [ControlSide(side(0)), ControlSide(side(1))],
                 clock: ModelClock::started_at(now_ns, crystal_ppm),
@@ -126,7 +147,7 @@ impl<'q> Machine<'q> {
                 chip: VirtualChip { flash, ending: None },
                 meter: VirtualMeter::default(),
             },
-            session: Session::new(consumer, identity),
+            session: Session::new(consumer, identity, session),
             port,
             buses,
             loops,
@@ -256,7 +277,7 @@ impl<'q> Machine<'q> {
                 board.capture.on_receive(channel, &mut board.traffic[index], &board.clock, entered);
             }
             if interrupts.transmit {
-                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, entered);
+                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, Some(entered));
             }
             if interrupts.error {
                 board.capture.on_error(channel, &mut board.traffic[index], entered);

@@ -26,6 +26,8 @@ mod signals;
 #[cfg(feature = "bench")]
 mod stats;
 #[cfg(feature = "bench")]
+mod tasks;
+#[cfg(feature = "bench")]
 mod wire;
 
 use anyhow::Result;

@@ -70,8 +70,8 @@ fn one_protocol_or_only_faults_can_be_asked_for() {
 
 #[test]
 fn programs_get_an_object_for_each_line() {
-    let (code, out, err) = cantap("conversations_json", WORKSHOP, &["--json", "--quiet"]);
-    assert_eq!((code, err.as_str()), (Some(0), ""));
+    let (code, out, err) = cantap("conversations_json", WORKSHOP, &["--json"]);
+    assert_eq!(code, Some(0), "{err}");
     let objects: Vec<serde_json::Value> =
         out.lines().map(|line| serde_json::from_str(line).unwrap()).collect();
     let first = &objects[0];
@@ -95,6 +95,8 @@ fn programs_get_an_object_for_each_line() {
     assert_eq!(objects[2]["units"]["engine_speed"], "rpm");
     assert_eq!((&objects[3]["trouble"], &objects[3]["kind"]), (&"sequence".into(), &"broken".into()));
     assert_eq!(objects[4]["kind"], "no_response");
+    let summary = &objects[5]["summary"];
+    assert_eq!((&summary["frames"], &summary["faults"]["uds"]), (&14.into(), &2.into()));
 }
 
 #[test]
@@ -113,4 +115,53 @@ fn a_bus_that_speaks_nothing_known_says_what_to_do() {
     let (code, out, err) = cantap("conversations_none", "(1.0) can0 123#11\n(2.0) can0 123#12\n", &[]);
     assert_eq!((code, out.as_str()), (Some(0), ""));
     assert!(err.contains("name one with --protocol"), "{err}");
+}
+
+/// A vehicle on channel 1, a machine on channel 2, a boat on channel 3, a plant on channel 4: each is read by what it speaks.
+#[test]
+fn each_channel_is_read_by_what_it_speaks() {
+    let log = "\
+(1.0) can0 0CF00400#FFFFFF6813FFFFFF
+(1.1) can0 18FEF100#0000000000000000
+(1.2) can0 18FECAFF#04FFBE0A0302FFFF
+(1.0) can1 705#00
+(1.1) can1 605#4018100100000000
+(1.2) can1 585#4318100178563412
+(1.3) can1 185#0102
+(1.0) can2 09F80102#36729A16021AB80D
+(1.1) can2 09F80102#36729A16021AB80D
+(1.0) can3 42F#00010078563412
+(2.0) can3 42F#00010078563412
+(3.0) can3 42C#000E010107
+(3.1) can3 42B#008E05
+";
+    let (code, out, err) = cantap("conversations_all", log, &[]);
+    assert_eq!(code, Some(0), "{err}");
+    for (channel, protocol) in [(1, "j1939"), (2, "canopen"), (3, "nmea2000"), (4, "devicenet")] {
+        assert!(err.contains(&format!("channel {channel} speaks {protocol}\n")), "{err}");
+        let of_channel: Vec<_> =
+            out.lines().filter(|line| line.contains(&format!(" can{} ", channel - 1))).collect();
+        assert!(of_channel.len() >= 2, "{out}");
+        assert!(of_channel.iter().all(|line| line.contains(protocol)), "{out}");
+    }
+    assert!(out.contains("Latitude 37.9220534 deg"), "{out}");
+    assert!(out.contains("SPN 2750 FMI 3"), "{out}");
+}
+
+#[test]
+fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("conversations_sheet");
+    std::fs::create_dir_all(&directory).unwrap();
+    let sheet = "[DeviceInfo]\n[1A00]\nObjectType=9\n[1A00sub0]\nDefaultValue=1\n[1A00sub1]\nDefaultValue=0x60410010\n\
+                 [6041]\nParameterName=Statusword\nDataType=6\nrubbish\n";
+    std::fs::write(directory.join("drive.eds"), sheet).unwrap();
+    let log = "(1.0) can0 705#00\n(1.1) can0 185#3702\n(1.2) can0 186#3702\n";
+    let (code, out, err) = cantap("conversations_sheet", log, &["--eds", "5:drive.eds"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("TPDO1: Statusword 567\n") && out.contains("TPDO1: data 37 02\n"), "{out}");
+    assert!(err.contains("drive.eds: line 11: neither a section nor a key: rubbish"), "{err}");
+    let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "bus.log"]);
+    assert!(code == Some(1) && err.contains("is no EDS or DCF"), "{err}");
+    let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "200:drive.eds"]);
+    assert!(code == Some(2) && err.contains("nodes from 1 to 127"), "{err}");
 }

@@ -1,20 +1,24 @@
 //! `cantap conversations`: what the frames mean.
 
 mod json;
+mod sheet;
 mod summary;
 mod surveyed;
 
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::Arc;
 
 use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::Interface;
 
+use self::sheet::SheetPath;
 use self::summary::Summary;
 use self::surveyed::Surveyed;
 use super::decode::Seconds;
+use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
 
@@ -23,19 +27,23 @@ use crate::live::LiveArgs;
 #[command(after_help = "Examples:\n  \
     cantap conversations drive.log\n  \
     cantap conversations drive.blf --protocol uds --protocol obd --json\n  \
+    cantap conversations tractor.asc --db machine.dbc\n  \
+    cantap conversations plant.log --eds 5:drive.eds --eds 6:io.dcf\n  \
     cantap conversations workshop.log --pair 6F1/12:612/F1\n  \
     cantap conversations -d /dev/ttyACM0 -b 500k\n\n\
 Without --protocol, each channel is read by the protocols that its first frames show, which are named on\n\
 standard error. A line is: time, interface, protocol, sender > receiver, what was said, and for a response\n\
 how long it took. Where frames were lost, what was under way says so. With --json each line is an object:\n\
-{\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", …}, see docs/protocols.md.")]
+{\"time_s\", \"start_s\", \"channel\", \"protocol\", \"kind\", \"from\", \"to\", \"title\", \"fields\", …}, see docs/protocols.md. The last line is {\"summary\"}.")]
 pub struct Args {
     /// The trace; - for standard input.
     #[arg(value_name = "FILE")]
     input: Option<PathBuf>,
     #[command(flatten)]
     live: LiveArgs,
-    /// Only this protocol, on every channel: isotp, uds, kwp2000 or obd. Several with commas, or repeated. isotp
+    #[command(flatten)]
+    databases: DatabaseArgs,
+    /// Only this protocol, on every channel: isotp, uds, kwp2000, obd, j1939, nmea2000, canopen or devicenet. Several with commas, or repeated. isotp
     /// alone shows transfers as they are.
     #[arg(long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
     protocols: Vec<Protocol>,
@@ -43,6 +51,9 @@ pub struct Args {
     /// 6F1/12:612/F1. Can be repeated. Others are found by what they do.
     #[arg(long = "pair", value_name = "ID:ID")]
     pairs: Vec<Pair>,
+    /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
+    #[arg(long = "eds", value_name = "[NODE:]FILE")]
+    sheets: Vec<SheetPath>,
     /// Only what went wrong: refusals, requests without a response, transfers that broke.
     #[arg(long)]
     faults: bool,
@@ -58,6 +69,12 @@ pub struct Args {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let databases = args.databases.or_of(args.live.devices());
+    let decoder = (!databases.is_empty())
+        .then(|| databases.load(args.read.strict, args.quiet))
+        .transpose()?
+        .map(Arc::new);
+    let sheets = args.sheets.iter().map(|path| path.load(args.quiet)).collect::<anyhow::Result<Vec<_>>>()?;
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
     let mut surveyed = Surveyed::new(args.protocols.is_empty());
@@ -73,7 +90,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 surveyed::tell(found.as_deref());
             }
             let (protocols, pairs) = (args.protocols.clone(), args.pairs.clone());
-            conversations = Some(Conversations::new(Options { protocols, pairs, spoken: found }));
+            let options =
+                Options { protocols, pairs, spoken: found, decoder: decoder.clone(), sheets: sheets.clone() };
+            conversations = Some(Conversations::new(&options));
             batch = surveyed.release();
         }
         if let Some(conversations) = &mut conversations {

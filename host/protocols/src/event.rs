@@ -278,12 +278,12 @@ impl fmt::Display for Value {
     }
 }
 
-/// Six decimals at most, and none that say nothing.
+/// Seven decimals at most, as positions have, and none that say nothing.
 fn write_real(f: &mut fmt::Formatter<'_>, value: f64) -> fmt::Result {
     if value.abs() >= 1e15 {
         return write!(f, "{value:e}");
     }
-    let text = format!("{value:.6}");
+    let text = format!("{value:.7}");
     let text = text.trim_end_matches('0').trim_end_matches('.');
     if text.trim_start_matches('-') == "0" && value != 0.0 {
         return write!(f, "{value:e}");

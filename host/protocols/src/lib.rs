@@ -6,10 +6,14 @@
 #![forbid(unsafe_code)]
 
 mod assembler;
+pub mod canopen;
 mod conversations;
+pub mod devicenet;
 pub mod diagnostics;
 mod event;
 pub mod iso_tp;
+pub mod j1939;
+pub mod nmea2000;
 mod protocol;
 mod survey;
 #[cfg(test)]

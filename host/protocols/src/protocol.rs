@@ -15,11 +15,20 @@ pub enum Protocol {
     Kwp2000,
     /// Services 01 to 0A of SAE J1979.
     Obd,
+    /// SAE J1939.
+    J1939,
+    /// NMEA 2000.
+    Nmea2000,
+    /// CANopen: CiA 301 and 305.
+    CanOpen,
+    /// DeviceNet.
+    DeviceNet,
 }
 
 impl Protocol {
     /// All of them.
-    pub const ALL: [Self; 4] = [Self::IsoTp, Self::Uds, Self::Kwp2000, Self::Obd];
+    pub const ALL: [Self; 6] =
+        [Self::IsoTp, Self::Uds, Self::Kwp2000, Self::Obd, Self::J1939, Self::Nmea2000];
 
     /// As it is called in text, JSON and on the command line.
     pub const fn name(self) -> &'static str {
@@ -28,6 +37,10 @@ impl Protocol {
             Self::Uds => "uds",
             Self::Kwp2000 => "kwp2000",
             Self::Obd => "obd",
+            Self::J1939 => "j1939",
+            Self::Nmea2000 => "nmea2000",
+            Self::CanOpen => "canopen",
+            Self::DeviceNet => "devicenet",
         }
     }
 

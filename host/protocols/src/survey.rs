@@ -3,7 +3,11 @@
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
 
+use crate::canopen;
+use crate::devicenet;
 use crate::diagnostics::Diagnostics;
+use crate::j1939::{self, Header};
+use crate::nmea2000;
 use crate::{Assembler, Event, Protocol};
 
 /// Looks at the first records of a trace or a bus.
@@ -12,6 +16,10 @@ pub struct Survey {
     diagnostics: Diagnostics,
     events: Vec<Event>,
     seen: FxHashMap<(u8, Protocol), u32>,
+    /// Extended frames: those of NMEA 2000's groups, of J1939's, and all.
+    extended: FxHashMap<u8, [u32; 3]>,
+    canopen: FxHashMap<u8, canopen::CanOpenSigns>,
+    devicenet: FxHashMap<u8, devicenet::DeviceNetSigns>,
 }
 
 /// That a channel speaks a protocol.
@@ -34,6 +42,18 @@ impl Survey {
     /// Takes the next record.
     pub fn take(&mut self, record: &TraceRecord) {
         self.diagnostics.take(record, &mut self.events);
+        if let Some(frame) = record.frame() {
+            self.canopen.entry(record.channel).or_default().take(frame);
+            self.devicenet.entry(record.channel).or_default().take(frame);
+        }
+        let header =
+            record.frame().filter(|frame| !frame.is_remote()).and_then(|frame| Header::of(frame.id()));
+        if let Some(header) = header {
+            let [marine, vehicle, all] = self.extended.entry(record.channel).or_default();
+            *all += 1;
+            *marine += u32::from(nmea2000::is_known(header.pgn));
+            *vehicle += u32::from(j1939::is_known(header.pgn));
+        }
         for event in self.events.drain(..) {
             let convinces = match event.protocol {
                 Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
@@ -52,6 +72,30 @@ impl Survey {
             .iter()
             .map(|(&(channel, protocol), &messages)| Evidence { channel, protocol, messages })
             .collect();
+        for (&channel, &[marine, vehicle, all]) in &self.extended {
+            // Other 29-bit traffic hits a known number now and then.
+            let enough = |known: u32| known > 1 && known > all / 10;
+            let protocol = match (enough(marine), enough(vehicle)) {
+                (true, _) => Protocol::Nmea2000,
+                (_, true) => Protocol::J1939,
+                _ => continue,
+            };
+            found.push(Evidence { channel, protocol, messages: marine.max(vehicle) });
+        }
+        for (&channel, signs) in &self.canopen {
+            let messages = signs.count();
+            if messages > 0 {
+                found.push(Evidence { channel, protocol: Protocol::CanOpen, messages });
+            }
+        }
+        for (&channel, signs) in &self.devicenet {
+            let messages = signs.count();
+            // CANopen's SDO servers have identifiers that are DeviceNet's, too.
+            let is_canopen = self.canopen.get(&channel).is_some_and(|signs| signs.count() > 0);
+            if messages > 0 && !is_canopen {
+                found.push(Evidence { channel, protocol: Protocol::DeviceNet, messages });
+            }
+        }
         found.sort_unstable();
         found
     }

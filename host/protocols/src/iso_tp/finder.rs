@@ -4,8 +4,10 @@ use cantap_trace::Id;
 
 use super::pairs::{Endpoint, Pair};
 use super::pci::{self, FlowStatus, Pci};
-use super::{FLOW_TIMEOUT_NS, Transfer};
+use super::transfer::Transfer;
 
+/// How long the sender waits for flow control: N_Bs (ISO 15765-2:2016, table 21).
+const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
 /// First frames that wait for their flow control, on all channels.
 const MOST_CANDIDATES: usize = 64;
 
@@ -30,6 +32,16 @@ impl Finder {
     /// Takes a frame; returns the pair and the transfer that has begun when this frame is its first consecutive one, which is still
     /// to be taken as such.
     pub fn take(&mut self, channel: u8, id: Id, bytes: &[u8], time_ns: i64) -> Option<(Pair, Transfer)> {
+        // Who sends anything else before its first consecutive frame sends no transfer.
+        if !self.candidates.is_empty() {
+            let goes_on = |candidate: &Candidate| {
+                let place = usize::from(candidate.from.address.is_some());
+                bytes.get(place) == Some(&0x21) && candidate.flow.is_some()
+            };
+            self.candidates.retain(|candidate| {
+                (candidate.channel, candidate.from.id) != (channel, id) || goes_on(candidate)
+            });
+        }
         // The address may be in front of it or not.
         for offset in [0, 1] {
             let Some(&first) = bytes.get(offset) else { continue };

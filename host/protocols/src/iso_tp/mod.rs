@@ -11,9 +11,11 @@ mod pairs;
 mod pci;
 #[cfg(test)]
 mod tests;
+mod transfer;
 
 pub use pairs::{BadPair, Endpoint, Pair};
 pub use pci::{FlowStatus, Pci, parse};
+pub use transfer::Transfer;
 
 use cantap_trace::TraceRecord;
 use rustc_hash::FxHashMap;
@@ -22,8 +24,6 @@ use self::finder::Finder;
 use self::pairs::Pairs;
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
 
-/// How long the sender waits for flow control: N_Bs (ISO 15765-2:2016, table 21).
-const FLOW_TIMEOUT_NS: i64 = 1_000_000_000;
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
 /// Between two looks for what has timed out.
@@ -34,66 +34,6 @@ const MOST_OPEN: usize = 256;
 const MOST_BYTES: usize = 1 << 16;
 /// A transfer of a pair that was only just found is told as broken from so many frames on; before, it was none.
 const FRAMES_THAT_CONVINCE: u32 = 4;
-
-/// A message of one or many frames, or as much of it as there was.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub struct Transfer {
-    /// The stamp of the last frame, or when it was given up, in nanoseconds.
-    pub time_ns: i64,
-    /// The stamp of the first frame.
-    pub start_ns: i64,
-    /// The channel, from 1.
-    pub channel: u8,
-    /// The sender.
-    pub from: Endpoint,
-    /// The receiver, where it is known and only one.
-    pub to: Option<Endpoint>,
-    /// The bytes.
-    pub data: Vec<u8>,
-    /// How many there should be.
-    pub length: u32,
-    /// The frames that it took, flow control included.
-    pub frames: u32,
-    /// What the receiver asked for last: frames until the next flow control.
-    pub block_size: Option<u8>,
-    /// What the receiver asked for last: microseconds between two frames.
-    pub separation_us: Option<u32>,
-    /// Flow control frames that asked to wait.
-    pub waits: u32,
-    /// Frames that came earlier than the receiver had asked for.
-    pub too_early: u32,
-    /// What went wrong.
-    pub trouble: Option<Trouble>,
-    /// Frames of the channel were lost meanwhile.
-    pub frames_lost: bool,
-}
-
-impl Transfer {
-    /// Whether all of it is there.
-    pub fn is_whole(&self) -> bool {
-        self.trouble.is_none()
-    }
-
-    const fn empty() -> Self {
-        let id = cantap_trace::Id::standard_truncated(0);
-        Self {
-            time_ns: 0,
-            start_ns: 0,
-            channel: 0,
-            from: Endpoint { id, address: None },
-            to: None,
-            data: Vec::new(),
-            length: 0,
-            frames: 0,
-            block_size: None,
-            separation_us: None,
-            waits: 0,
-            too_early: 0,
-            trouble: None,
-            frames_lost: false,
-        }
-    }
-}
 
 /// A transfer under way.
 #[derive(Clone, Debug)]

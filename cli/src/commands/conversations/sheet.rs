@@ -1,0 +1,49 @@
+//! The sheets of CANopen nodes, as they are given.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use anyhow::Context;
+use cantap_protocols::canopen::Sheet;
+use cantap_protocols::canopen::eds::Eds;
+
+/// A sheet's file and its node.
+#[derive(Clone, Debug)]
+pub(super) struct SheetPath {
+    node: Option<u8>,
+    path: PathBuf,
+}
+
+impl FromStr for SheetPath {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        // A drive letter is no number, so that Windows' paths pass.
+        let numbered = text.split_once(':').filter(|(number, _)| number.parse::<u32>().is_ok());
+        let Some((number, path)) = numbered else { return Ok(Self { node: None, path: text.into() }) };
+        match number.parse() {
+            Ok(node @ 1..=127) if !path.is_empty() => Ok(Self { node: Some(node), path: path.into() }),
+            _ => Err("write it as FILE or NODE:FILE, with nodes from 1 to 127".to_owned()),
+        }
+    }
+}
+
+impl SheetPath {
+    /// Reads the file; what of it is not understood goes to standard error, unless `quiet`.
+    pub fn load(&self, quiet: bool) -> anyhow::Result<Sheet> {
+        let name = self.path.display();
+        let bytes = std::fs::read(&self.path).with_context(|| format!("cannot read the sheet {name}"))?;
+        let eds = Eds::parse(&bytes);
+        anyhow::ensure!(
+            !eds.objects.is_empty(),
+            "{name} is no EDS or DCF: there is no object in it; give the file that came with the device"
+        );
+        if !quiet {
+            for issue in &eds.issues {
+                eprintln!("cantap: {name}: {issue}");
+            }
+        }
+        Ok(Sheet { node: self.node.or(eds.node), eds: Arc::new(eds) })
+    }
+}

@@ -1,0 +1,104 @@
+//! How many frames a second all protocols read together: `cargo run --release -p cantap-protocols --example speed`.
+//!
+//! A second of a vehicle with a diagnostic session beside its cyclic frames, a truck, a boat and a plant, again and again; each on a channel of its
+//! own, as a survey would find them, and once more with every protocol on every channel.
+
+use std::hint::black_box;
+use std::time::Instant;
+
+use cantap_protocols::{Conversations, Evidence, Options, Protocol};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+
+const ROUNDS: i64 = 200;
+
+fn main() {
+    let buses = [
+        ("vehicle", Protocol::Uds, vehicle as fn(u32) -> String),
+        ("truck", Protocol::J1939, truck),
+        ("boat", Protocol::Nmea2000, boat),
+        ("plant", Protocol::CanOpen, plant),
+    ];
+    for (channel, (name, protocol, frame)) in (1_u8..).zip(buses) {
+        let records: Vec<_> = (0..10_000).map(|at| record(channel, at, &frame(at))).collect();
+        let spoken = vec![Evidence { channel, protocol, messages: 1 }];
+        measure(name, &records, &Options { spoken: Some(spoken), ..Options::default() });
+        let all = Options { protocols: Protocol::ALL.to_vec(), ..Options::default() };
+        measure(&format!("{name}, all protocols"), &records, &all);
+    }
+}
+
+fn record(channel: u8, at: u32, frame: &str) -> TraceRecord {
+    let frame = frame.parse().expect("frames of this file are frames");
+    let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+    TraceRecord { time_ns: i64::from(at) * 100_000, channel, event }
+}
+
+fn measure(name: &str, records: &[TraceRecord], options: &Options) {
+    let mut conversations = Conversations::new(options);
+    let (mut events, mut count) = (Vec::new(), 0);
+    let start = Instant::now();
+    for round in 0..ROUNDS {
+        for record in records {
+            let record = TraceRecord { time_ns: record.time_ns + round * 1_000_000_000, ..*record };
+            conversations.take(&record, &mut events);
+        }
+        count += events.len();
+        black_box(&events);
+        events.clear();
+    }
+    let seconds = start.elapsed().as_secs_f64();
+    let frames = records.len() as f64 * ROUNDS as f64;
+    println!("{name:<24} {:>6.2} M frames/s, {count} events", frames / seconds / 1e6);
+}
+
+/// One frame in ten is diagnostics.
+fn vehicle(at: u32) -> String {
+    const TALK: [&str; 5] = [
+        "7E0#0322F190",
+        "7E8#101462F190575657",
+        "7E0#300000",
+        "7E8#215A5A5A314B5A41",
+        "7E8#2257303030303031",
+    ];
+    match at % 10 {
+        0 => TALK[(at / 10 % 5) as usize].to_owned(),
+        other => {
+            format!("{:03X}#{:016X}", 0x100 + other * 0x21, u64::from(at).wrapping_mul(0x9E37_79B9_7F4A_7C15))
+        }
+    }
+}
+
+/// Trouble codes by broadcast beside groups of one frame.
+fn truck(at: u32) -> String {
+    const TALK: [&str; 3] =
+        ["1CECFF00#200A0002FFCAFE00", "1CEBFF00#0104FFBE0A038221", "1CEBFF00#021F037FFFFFFFFF"];
+    match at % 10 {
+        0 => TALK[(at / 10 % 3) as usize].to_owned(),
+        other => format!("0CF00{other}00#{:016X}", u64::from(at)),
+    }
+}
+
+/// A position in a fast packet of seven frames, beside groups of one frame.
+fn boat(at: u32) -> String {
+    const TALK: [&str; 7] = [
+        "0DF80502#402FD2C73F00E73A",
+        "0DF80502#4124C0A424231143",
+        "0DF80502#424305809E757091",
+        "0DF80502#43B9310385C88F02",
+        "0DF80502#440000000013FC0C",
+        "0DF80502#4549008000AC0D00",
+        "0DF80502#460000FFFFFFFFFF",
+    ];
+    if at % 2 == 0 { TALK[(at / 2 % 7) as usize].to_owned() } else { "09F80102#36729A16021AB80D".to_owned() }
+}
+
+/// PDOs, heartbeats, and an SDO transfer now and then.
+fn plant(at: u32) -> String {
+    match at % 10 {
+        0 => "605#4018100100000000".to_owned(),
+        1 => "585#4318100178563412".to_owned(),
+        2 => format!("7{:02X}#05", at / 10 % 5 + 1),
+        3 => "080#".to_owned(),
+        other => format!("{:03X}#{:016X}", 0x180 + 0x80 * (other - 4) + at / 10 % 5 + 1, u64::from(at)),
+    }
+}

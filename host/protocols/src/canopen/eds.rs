@@ -1,0 +1,311 @@
+//! Electronic data sheets and device configuration files (CiA 306): every object of the file, or the reason why not.
+
+use std::collections::BTreeMap;
+
+/// What a file says of a device.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Eds {
+    /// The device's name.
+    pub product: String,
+    /// Its maker.
+    pub vendor: String,
+    /// The node's number, where the file is of one node (DCF).
+    pub node: Option<u8>,
+    /// By index.
+    pub objects: BTreeMap<u16, Object>,
+    /// What of the file was not understood, each with its line where there is one.
+    pub issues: Vec<String>,
+}
+
+/// An object: a variable, or one with entries.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Object {
+    /// Its name.
+    pub name: String,
+    /// Its object code: 7 a variable, 8 an array, 9 a record.
+    pub code: u8,
+    /// By sub-index; a variable has 0.
+    pub entries: BTreeMap<u8, Entry>,
+}
+
+/// A value of the dictionary.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Entry {
+    /// Its name.
+    pub name: String,
+    /// Its data type (CiA 301, table 44).
+    pub data_type: Option<u16>,
+    /// As `ro`, `rw`, `wo`, `const`.
+    pub access: String,
+    /// The value set for this node (DCF), else the default.
+    pub value: String,
+    /// Whether a PDO may carry it.
+    pub mappable: bool,
+}
+
+/// A section of the file: its line and its keys.
+#[derive(Default)]
+struct Section {
+    line: usize,
+    keys: BTreeMap<String, String>,
+}
+
+impl Section {
+    fn text(&self, key: &str) -> String {
+        self.keys.get(key).cloned().unwrap_or_default()
+    }
+
+    fn number(&self, key: &str) -> Option<i64> {
+        number(self.keys.get(key)?, 0)
+    }
+}
+
+/// Decimal, hexadecimal with 0x, octal with a 0 in front; `$NODEID` may be added.
+pub fn number(text: &str, node: u8) -> Option<i64> {
+    text.split('+').try_fold(0_i64, |sum, part| {
+        let part = part.trim();
+        let value = if part.eq_ignore_ascii_case("$NODEID") {
+            node.into()
+        } else if let Some(digits) = part.strip_prefix("0x").or_else(|| part.strip_prefix("0X")) {
+            i64::try_from(u64::from_str_radix(digits, 16).ok()?).ok()?
+        } else if part.len() > 1
+            && part.starts_with('0')
+            && part.bytes().all(|byte| (b'0'..=b'7').contains(&byte))
+        {
+            i64::from_str_radix(part, 8).ok()?
+        } else {
+            part.parse().ok()?
+        };
+        sum.checked_add(value)
+    })
+}
+
+impl Eds {
+    /// Reads a file's text. It may be in any 8-bit coding: what is not ASCII stands in names only.
+    pub fn parse(bytes: &[u8]) -> Self {
+        let mut eds = Self::default();
+        let text = String::from_utf8_lossy(bytes);
+        let sections = eds.sections(text.trim_start_matches('\u{FEFF}'));
+        if let Some(info) = sections.get("deviceinfo") {
+            (eds.product, eds.vendor) = (info.text("productname"), info.text("vendorname"));
+        } else {
+            eds.issues.push("there is no section [DeviceInfo]".to_owned());
+        }
+        let commissioning =
+            sections.get("devicecomissioning").or_else(|| sections.get("devicecommissioning"));
+        eds.node = commissioning
+            .and_then(|section| section.number("nodeid"))
+            .and_then(|node| u8::try_from(node).ok())
+            .filter(|node| (1..=127).contains(node));
+        for (name, section) in &sections {
+            eds.object(name, section, &sections);
+        }
+        for (name, section) in &sections {
+            eds.sub_object(name, section);
+        }
+        for list in ["mandatoryobjects", "optionalobjects", "manufacturerobjects"] {
+            eds.check_list(list, sections.get(list));
+        }
+        eds
+    }
+
+    fn sections(&mut self, text: &str) -> BTreeMap<String, Section> {
+        let mut sections: BTreeMap<String, Section> = BTreeMap::new();
+        let mut current: Option<String> = None;
+        for (at, line) in text.lines().enumerate() {
+            let line_number = at + 1;
+            let line = line.trim();
+            if line.is_empty() || line.starts_with([';', '#']) {
+                continue;
+            }
+            if let Some(name) = line.strip_prefix('[') {
+                let Some((name, _)) = name.split_once(']') else {
+                    self.issues.push(format!("line {line_number}: a section without ']'"));
+                    continue;
+                };
+                let name = name.trim().to_ascii_lowercase();
+                if sections.contains_key(&name) {
+                    self.issues.push(format!(
+                        "line {line_number}: the section [{name}] is there twice; its keys are put together"
+                    ));
+                } else {
+                    sections.insert(name.clone(), Section { line: line_number, ..Section::default() });
+                }
+                current = Some(name);
+                continue;
+            }
+            match (line.split_once('='), current.as_ref().and_then(|name| sections.get_mut(name))) {
+                (Some((key, value)), Some(section)) => {
+                    section.keys.insert(key.trim().to_ascii_lowercase(), value.trim().to_owned());
+                }
+                (Some(_), None) => {
+                    self.issues.push(format!("line {line_number}: a key before the first section"));
+                }
+                (None, _) => {
+                    self.issues.push(format!("line {line_number}: neither a section nor a key: {line}"));
+                }
+            }
+        }
+        sections
+    }
+
+    fn entry(&mut self, name: &str, section: &Section) -> Entry {
+        let data_type = section.number("datatype").and_then(|kind| u16::try_from(kind).ok());
+        if data_type.is_none() && section.keys.contains_key("datatype") {
+            self.issues.push(format!("line {}: the data type of [{name}] is no number", section.line));
+        }
+        let set = section.keys.get("parametervalue").filter(|value| !value.is_empty());
+        Entry {
+            name: section.text("parametername"),
+            data_type,
+            access: section.text("accesstype").to_ascii_lowercase(),
+            value: set.cloned().unwrap_or_else(|| section.text("defaultvalue")),
+            mappable: section.number("pdomapping") == Some(1),
+        }
+    }
+
+    /// `[1018]`: an object.
+    fn object(&mut self, name: &str, section: &Section, sections: &BTreeMap<String, Section>) {
+        let Some(index) = index(name) else { return };
+        let code = section.number("objecttype").and_then(|code| u8::try_from(code).ok()).unwrap_or(7);
+        let mut object = Object { name: section.text("parametername"), code, ..Object::default() };
+        let compact = section.number("compactsubobj").unwrap_or(0);
+        if compact > 0 {
+            // An array in one section: all entries are alike, named and set in sections of their own (CiA 306, 6.3.3).
+            let model = self.entry(name, section);
+            let names = sections.get(&format!("{name}name"));
+            let values = sections.get(&format!("{name}value"));
+            let count = Entry {
+                name: "Highest sub-index supported".to_owned(),
+                data_type: Some(5),
+                access: "ro".to_owned(),
+                ..Entry::default()
+            };
+            object.entries.insert(0, count);
+            for sub in 1..=u8::try_from(compact).unwrap_or(254).min(254) {
+                let of = |section: Option<&Section>| {
+                    section.and_then(|section| section.keys.get(&sub.to_string()).cloned())
+                };
+                let entry = Entry {
+                    name: of(names).unwrap_or_else(|| format!("{}{sub}", model.name)),
+                    value: of(values).unwrap_or_else(|| model.value.clone()),
+                    ..model.clone()
+                };
+                object.entries.insert(sub, entry);
+            }
+        } else if matches!(code, 8 | 9) {
+            // Its entries are in sections of their own.
+        } else {
+            let entry = self.entry(name, section);
+            object.entries.insert(0, entry);
+        }
+        self.objects.insert(index, object);
+    }
+
+    /// `[1018sub1]`: an entry.
+    fn sub_object(&mut self, name: &str, section: &Section) {
+        let Some((object, sub)) = name.split_once("sub") else { return };
+        let Some(index) = index(object) else { return };
+        let Ok(sub) = u8::from_str_radix(sub, 16) else {
+            self.issues.push(format!("line {}: [{name}] is no sub-index", section.line));
+            return;
+        };
+        let entry = self.entry(name, section);
+        let line = section.line;
+        if let Some(object) = self.objects.get_mut(&index) {
+            object.entries.insert(sub, entry);
+        } else {
+            self.issues.push(format!("line {line}: [{name}] belongs to an object that has no section"));
+            let object = Object { name: entry.name.clone(), code: 9, entries: [(sub, entry)].into() };
+            self.objects.insert(index, object);
+        }
+    }
+
+    /// What the lists of objects promise must be there.
+    fn check_list(&mut self, list: &str, section: Option<&Section>) {
+        let Some(section) = section else { return };
+        let count = section.number("supportedobjects").unwrap_or(0);
+        let listed = section.keys.iter().filter(|(key, _)| key.parse::<u32>().is_ok());
+        let mut found = 0;
+        for (_, value) in listed {
+            found += 1;
+            match number(value, 0).and_then(|index| u16::try_from(index).ok()) {
+                Some(index) if self.objects.contains_key(&index) => {}
+                Some(index) => self.issues.push(format!("[{list}] names {index:04X}, which has no section")),
+                None => self.issues.push(format!("[{list}] names '{value}', which is no index")),
+            }
+        }
+        if count != found {
+            self.issues.push(format!("[{list}] promises {count} objects and names {found}"));
+        }
+    }
+
+    /// The entry of an object.
+    pub fn entry_of(&self, index: u16, sub: u8) -> Option<&Entry> {
+        self.objects.get(&index)?.entries.get(&sub)
+    }
+
+    /// An entry's value as a number, for a node.
+    pub fn value_of(&self, index: u16, sub: u8, node: u8) -> Option<u32> {
+        number(&self.entry_of(index, sub)?.value, node).and_then(|value| u32::try_from(value).ok())
+    }
+}
+
+/// Four hexadecimal digits and nothing else.
+fn index(name: &str) -> Option<u16> {
+    (name.len() == 4 && name.bytes().all(|byte| byte.is_ascii_hexdigit()))
+        .then(|| u16::from_str_radix(name, 16).ok())
+        .flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SHEET: &str = "\u{FEFF}; a comment\n[DeviceInfo]\nVendorName=Us\nProductName=Drive\n[DeviceComissioning]\nNodeID=0x05\n\
+        [MandatoryObjects]\nSupportedObjects=3\n1=0x1000\n2=0x1018\n3=0x1001\n[1000]\nParameterName=Device type\nObjectType=0x7\n\
+        DataType=0x0007\nAccessType=ro\nDefaultValue=0x191\n[1018]\nParameterName=Identity\nObjectType=9\nSubNumber=2\n\
+        [1018sub0]\nParameterName=Entries\nDataType=5\nAccessType=ro\nDefaultValue=1\n[1018Sub1]\nParameterName=Vendor\n\
+        DataType=7\nAccessType=ro\n[1800]\nParameterName=TPDO\nObjectType=9\n[1800sub1]\nParameterName=COB\nDataType=7\n\
+        DefaultValue=$NODEID+0x180\n[2000]\nParameterName=Table\nObjectType=8\nDataType=0x6\nAccessType=rw\nCompactSubObj=3\n\
+        PDOMapping=1\n[2000Name]\nNrOfEntries=1\n2=Second\n[2000Value]\nNrOfEntries=1\n1=7\n[3000sub1]\nParameterName=Lost\nrubbish\n";
+
+    #[test]
+    fn every_object_is_there_or_said_why_not() {
+        let eds = Eds::parse(SHEET.as_bytes());
+        assert_eq!((eds.product.as_str(), eds.vendor.as_str(), eds.node), ("Drive", "Us", Some(5)));
+        assert_eq!(eds.objects.keys().copied().collect::<Vec<_>>(), [0x1000, 0x1018, 0x1800, 0x2000, 0x3000]);
+        assert_eq!(eds.value_of(0x1800, 1, 5), Some(0x185));
+        assert_eq!(eds.entry_of(0x1018, 1).unwrap().name, "Vendor");
+        let table = &eds.objects[&0x2000].entries;
+        let names: Vec<_> = table.values().map(|entry| entry.name.as_str()).collect();
+        assert_eq!(names, ["Highest sub-index supported", "Table1", "Second", "Table3"]);
+        assert_eq!((table[&1].value.as_str(), table[&2].data_type, table[&2].mappable), ("7", Some(6), true));
+        assert_eq!(
+            eds.issues,
+            [
+                "line 53: neither a section nor a key: rubbish",
+                "line 51: [3000sub1] belongs to an object that has no section",
+                "[mandatoryobjects] names 1001, which has no section",
+            ]
+        );
+    }
+
+    #[test]
+    fn numbers_are_written_in_every_way() {
+        for (text, expected) in [
+            ("10", Some(10)),
+            ("0x1F", Some(31)),
+            ("010", Some(8)),
+            ("$NODEID+0x200", Some(0x205)),
+            ("0x200 + $nodeid", Some(0x205)),
+            ("", None),
+            ("x", None),
+            ("0", Some(0)),
+            ("-5", Some(-5)),
+            ("09", Some(9)),
+        ] {
+            assert_eq!(number(text, 5), expected, "{text}");
+        }
+    }
+}

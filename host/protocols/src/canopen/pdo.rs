@@ -1,0 +1,140 @@
+//! What PDOs carry: by an EDS, or by what was written to or read from their mapping parameters.
+
+use rustc_hash::FxHashMap;
+
+use super::eds::Eds;
+use super::{names, sdo, types};
+use crate::{Event, Field, Party, Protocol};
+use cantap_trace::TraceRecord;
+
+/// Mapping parameters of a node that are kept: 512 PDOs with eight entries each.
+const MOST_ENTRIES: usize = 512 * 9;
+
+/// One node's PDOs.
+#[derive(Default)]
+pub struct Pdos {
+    /// Mapping parameters that were heard, by index (1600 to 17FF, 1A00 to 1BFF) and sub-index.
+    mapped: FxHashMap<(u16, u8), u32>,
+    /// Identifiers that were set, by communication parameter (1400 to 15FF, 1800 to 19FF).
+    ids: FxHashMap<u16, u16>,
+}
+
+/// The communication parameter of the PDO that has one of the predefined identifiers.
+const fn parameter(number: u16) -> u16 {
+    let place = (number >> 7) - 3;
+    if place.is_multiple_of(2) { 0x1800 + place / 2 } else { 0x1400 + place / 2 }
+}
+
+impl Pdos {
+    /// Takes what an SDO transfer says; whether identifiers have changed.
+    pub fn learn(&mut self, node: u8, transfer: &sdo::SdoTransfer) -> bool {
+        let Ok(bytes) = <[u8; 4]>::try_from(transfer.data.as_slice()) else {
+            if let (0x1600..=0x17FF | 0x1A00..=0x1BFF, 0, [count]) =
+                (transfer.index, transfer.sub, &transfer.data[..])
+            {
+                self.map(transfer.index, 0, u32::from(*count));
+            }
+            return false;
+        };
+        let value = u32::from_le_bytes(bytes);
+        match (transfer.index, transfer.sub) {
+            (0x1600..=0x17FF | 0x1A00..=0x1BFF, 1..=64) => {
+                self.map(transfer.index, transfer.sub, value);
+                false
+            }
+            (index @ (0x1400..=0x15FF | 0x1800..=0x19FF), 1) => {
+                // Bit 31: it does not exist; bit 29: an extended identifier.
+                let id = (value & 0x7FF) as u16;
+                let predefined =
+                    u16::from(node) + 0x80 * (2 * (index & 0x1FF) + if index < 0x1800 { 4 } else { 3 });
+                if value & 0xA000_0000 == 0 && (id != predefined || (index & 0x1FF) > 3) {
+                    self.ids.insert(index, id);
+                } else {
+                    self.ids.remove(&index);
+                }
+                true
+            }
+            _ => false,
+        }
+    }
+
+    fn map(&mut self, index: u16, sub: u8, value: u32) {
+        if self.mapped.len() < MOST_ENTRIES || self.mapped.contains_key(&(index, sub)) {
+            self.mapped.insert((index, sub), value);
+        }
+    }
+
+    /// Identifiers that are not the predefined ones, each with its communication parameter.
+    pub fn ids(&self) -> impl Iterator<Item = (u16, u16)> + '_ {
+        self.ids.iter().map(|(index, id)| (*id, *index))
+    }
+
+    /// A PDO; `number` is its communication parameter, or the predefined identifier without the node.
+    pub fn event(
+        &self,
+        record: &TraceRecord,
+        node: u8,
+        number: u16,
+        data: &[u8],
+        sheet: Option<&Eds>,
+    ) -> Event {
+        let parameter = if number >= 0x1400 { number } else { parameter(number) };
+        let sends = parameter >= 0x1800;
+        let title = format!("{}PDO{}", if sends { 'T' } else { 'R' }, (parameter & 0x1FF) + 1);
+        let mut event = Event::new(Protocol::CanOpen, record, "pdo", title);
+        let mapping = parameter + 0x200;
+        if sends {
+            event.from = Party::Node(node);
+        } else {
+            event.to = Party::Node(node);
+        }
+        let entry = |sub: u8| {
+            let heard = self.mapped.get(&(mapping, sub)).copied();
+            heard.or_else(|| sheet.and_then(|eds| eds.value_of(mapping, sub, node)))
+        };
+        let mut at = 0;
+        for sub in 1..=entry(0).unwrap_or(0).min(64) as u8 {
+            let Some(mapped) = entry(sub) else { break };
+            let (index, of, bits) = ((mapped >> 16) as u16, (mapped >> 8) as u8, (mapped & 0xFF) as usize);
+            if bits == 0 || at + bits > data.len() * 8 {
+                break;
+            }
+            let bytes = cut(data, at, bits);
+            at += bits;
+            // Below 20h it is a type: room that nothing is in.
+            if index < 0x20 {
+                continue;
+            }
+            let known = sheet.and_then(|eds| eds.entry_of(index, of));
+            let name = known.map(|entry| entry.name.clone()).filter(|name| !name.is_empty());
+            let name = name.or_else(|| names::object(index).map(str::to_owned));
+            let mut field = Field::bytes(name.unwrap_or_else(|| format!("{index:04X}:{of:02X}")), &[]);
+            let data_type = known.and_then(|entry| entry.data_type).or_else(|| types::known(index, of));
+            field.value = types::value(data_type, &bytes);
+            event.fields.push(field);
+        }
+        if at == 0 {
+            event.fields.push(Field::bytes("data", data));
+        } else if at < data.len() * 8 {
+            event.fields.push(Field::bytes("rest", &data[at.div_ceil(8)..]));
+        }
+        event
+    }
+}
+
+/// Bits from anywhere, as bytes that begin with the lowest.
+fn cut(data: &[u8], at: usize, bits: usize) -> Vec<u8> {
+    let mut bytes: Vec<u8> = (0..bits.div_ceil(8))
+        .map(|number| {
+            let first = at + number * 8;
+            let byte = |place: usize| u16::from(data.get(place).copied().unwrap_or(0));
+            ((byte(first / 8) | byte(first / 8 + 1) << 8) >> (first % 8)) as u8
+        })
+        .collect();
+    if !bits.is_multiple_of(8)
+        && let Some(last) = bytes.last_mut()
+    {
+        *last &= (1 << (bits % 8)) - 1;
+    }
+    bytes
+}

@@ -1,0 +1,235 @@
+use super::*;
+use crate::testing::{self, at, hex, lost};
+
+fn said(frames: &[(f64, &str)]) -> Vec<String> {
+    testing::said(CanOpen::default(), frames)
+}
+
+#[test]
+fn what_the_network_is_told_and_what_nodes_are() {
+    assert_eq!(
+        said(&[
+            (0.0, "705#00"),
+            (1.0, "000#0105"),
+            (2.0, "705#05"),
+            (3.0, "000#8200"),
+            (4.0, "085#308104000000000A"),
+            (5.0, "100#00286C0A5034"),
+            (6.0, "705#7F"),
+        ]),
+        [
+            "canopen 5 boot-up",
+            "canopen ? > 5 start: command 1",
+            "canopen 5 operational: before \"boot-up\"",
+            "canopen ? > all reset communication: command 130",
+            "canopen 5 emergency: code 0x8130 (life guard or heartbeat error), register 0x04 (voltage), \
+             manufacturer 00 00 00 00 0A",
+            "canopen ? time: days_since_1984 13392, time_of_day_s 174860.288 s",
+            "canopen 5 pre-operational: before \"operational\"",
+        ]
+        .map(str::to_owned)
+    );
+}
+
+#[test]
+fn a_heartbeat_that_stops_and_comes_back_is_said() {
+    let beats = [
+        (0.0, "705#05"),
+        (100.0, "705#05"),
+        (200.0, "705#05"),
+        (600.0, "123#"),
+        (700.0, "705#05"),
+        (800.0, "705#05"),
+    ];
+    assert_eq!(
+        said(&beats),
+        [
+            "canopen 5 operational",
+            "canopen 5 heartbeat missing: period_ms 100 ms; nothing came for 250 ms",
+            "canopen ? RPDO1: data nothing",
+            "canopen 5 heartbeat is back: operational",
+        ]
+        .iter()
+        .filter(|line| !line.contains("RPDO"))
+        .map(|line| (*line).to_owned())
+        .collect::<Vec<_>>()
+    );
+    // Set by SDO, it is known before the second beat.
+    let set =
+        [(0.0, "605#2B17100032000000"), (1.0, "585#6017100000000000"), (2.0, "705#05"), (500.0, "200#")];
+    assert_eq!(said(&set)[2], "canopen 5 heartbeat missing: period_ms 50 ms; nothing came for 125 ms");
+    // Where frames were lost, beats may be among them.
+    let records =
+        [at(0.0, "705#05"), at(100.0, "705#05"), lost(150.0), at(900.0, "705#05"), at(1000.0, "705#05")];
+    let events = testing::events(CanOpen::default(), &records);
+    assert_eq!(events.len(), 1, "{events:?}");
+}
+
+#[test]
+fn guarding_is_followed() {
+    let guard = [
+        (0.0, "705#R1"),
+        (1.0, "705#05"),
+        (100.0, "705#R1"),
+        (101.0, "705#85"),
+        (200.0, "705#R1"),
+        (201.0, "705#85"),
+        (300.0, "705#R1"),
+        (900.0, "200#"),
+    ];
+    assert_eq!(
+        said(&guard),
+        [
+            "canopen 5 operational: after 1 ms",
+            "canopen 5 operational; frame 1 came instead of 0",
+            "canopen 5 no answer to guarding; nothing came for 500 ms",
+        ]
+        .map(str::to_owned)
+    );
+}
+
+#[test]
+fn sdo_transfers_of_every_kind_are_one_event() {
+    for (frames, expected) in [
+        (
+            &[(0.0, "605#4018100100000000"), (1.0, "585#4318100178563412")][..],
+            "canopen ? > 5 SDO read 1018:01: index 0x1018 (identity object), sub 0x01, transport \"expedited\", value 0x12345678, after 1 ms",
+        ),
+        (
+            &[(0.0, "605#2B171000E8030000"), (2.0, "585#6017100000000000")],
+            "canopen ? > 5 SDO write 1017:00: index 0x1017 (producer heartbeat time), sub 0x00, transport \"expedited\", value 1000, after 2 ms",
+        ),
+        (
+            &[(0.0, "605#4000200000000000"), (1.0, "585#8000200000000206")],
+            "canopen ? > 5 SDO read 2000:00: index 0x2000, sub 0x00, abort 0x06020000 (object does not exist), after 1 ms; \
+             aborted: object does not exist",
+        ),
+        (
+            &[
+                (0.0, "605#4008100000000000"),
+                (1.0, "585#410810000A000000"),
+                (2.0, "605#6000000000000000"),
+                (3.0, "585#0054686520647269"),
+                (4.0, "605#7000000000000000"),
+                (5.0, "585#1976657200000000"),
+            ],
+            "canopen ? > 5 SDO read 1008:00: index 0x1008 (manufacturer device name), sub 0x00, transport \"segmented\", \
+             value \"The driver\", after 1 ms",
+        ),
+        (
+            &[(0.0, "605#4018100100000000")],
+            "canopen ? > 5 SDO read 1018:01: index 0x1018 (identity object), sub 0x01, transport \"expedited\"; the trace ends here",
+        ),
+        (
+            &[(0.0, "605#4018100100000000"), (3000.0, "200#")],
+            "canopen ? > 5 SDO read 1018:01: index 0x1018 (identity object), sub 0x01, transport \"expedited\"; nothing came for 2000 ms",
+        ),
+    ] {
+        assert_eq!(said(frames), [expected], "{frames:?}");
+    }
+}
+
+/// A segment that is missing, or comes twice, shows by its toggle bit.
+#[test]
+fn a_missing_segment_is_said() {
+    let said = said(&[
+        (0.0, "605#4008100000000000"),
+        (1.0, "585#410810000A000000"),
+        (2.0, "605#6000000000000000"),
+        (5.0, "585#1976657200000000"),
+    ]);
+    assert!(said[0].ends_with("frame 1 came instead of 0"), "{said:?}");
+}
+
+#[test]
+fn blocks_are_put_together_with_what_is_sent_again() {
+    let data: Vec<u8> = (0..40).collect();
+    let mut frames = vec!["605#C600200028000000".to_owned(), "585#A400200004000000".to_owned()];
+    let segment = |number: u8, last: bool, from: usize| {
+        let mut bytes = data[from..data.len().min(from + 7)].to_vec();
+        bytes.resize(7, 0);
+        format!("605#{:02X}{}", number | if last { 0x80 } else { 0 }, hex(&bytes))
+    };
+    for number in 1..=4_u8 {
+        frames.push(segment(number, false, usize::from(number - 1) * 7));
+    }
+    // The fourth was not received and is sent again in a block of three.
+    frames.push("585#A203030000000000".to_owned());
+    frames.extend([segment(1, false, 21), segment(2, false, 28), segment(3, true, 35)]);
+    frames.push("585#A203040000000000".to_owned());
+    let crc = 0x81AF_u16;
+    frames.push(format!("605#C9{}0000000000", hex(&crc.to_le_bytes())));
+    frames.push("585#A100000000000000".to_owned());
+    let records: Vec<_> = frames.iter().enumerate().map(|(ms, frame)| at(ms as f64, frame)).collect();
+    let events = testing::events(CanOpen::default(), &records);
+    assert_eq!(events.len(), 1, "{:?}", events.iter().map(ToString::to_string).collect::<Vec<_>>());
+    assert_eq!(events[0].data, data);
+    let text = events[0].to_string();
+    assert!(text.contains("\"block\"") && events[0].trouble.is_none(), "{text}");
+}
+
+#[test]
+fn pdos_carry_what_was_written_or_what_the_sheet_says() {
+    let learned = [
+        (0.0, "605#2F001A0002000000"),
+        (1.0, "585#60001A0000000000"),
+        (2.0, "605#23001A0110004160"),
+        (3.0, "585#60001A0100000000"),
+        (4.0, "605#23001A0220006460"),
+        (5.0, "585#60001A0200000000"),
+        (6.0, "605#2300180190010000"),
+        (7.0, "585#6000180100000000"),
+        (8.0, "190#3702785634120000"),
+    ];
+    assert_eq!(
+        said(&learned).last().unwrap(),
+        "canopen 5 TPDO1: 6041:00 0x0237, 6064:00 0x12345678, rest 00 00"
+    );
+    let sheet = "[DeviceInfo]\n[1A00]\nObjectType=9\n[1A00sub0]\nDefaultValue=2\n[1A00sub1]\nDefaultValue=0x60410010\n\
+        [1A00sub2]\nDefaultValue=0x60640020\n[6041]\nParameterName=Statusword\nDataType=6\n[6064]\nParameterName=Position\nDataType=4\n";
+    let eds = Arc::new(Eds::parse(sheet.as_bytes()));
+    assert_eq!(eds.issues, [] as [String; 0]);
+    let with = CanOpen::new(vec![Sheet { node: None, eds }]);
+    assert_eq!(
+        testing::said(with, &[(0.0, "185#3702FFFFFFFF")]),
+        ["canopen 5 TPDO1: Statusword 567, Position -1"]
+    );
+}
+
+#[test]
+fn layer_settings_and_sync_counters() {
+    assert_eq!(
+        said(&[(0.0, "7E5#0401000000000000"), (1.0, "7E5#1107000000000000"), (2.0, "7E4#1100000000000000")]),
+        [
+            "canopen ? LSS switch state global: mode 1 (configuration)",
+            "canopen ? LSS configure node number: node 7",
+            "canopen ? LSS configure node number: error 0 (success), device_error 0, after 1 ms",
+        ]
+        .map(str::to_owned)
+    );
+    assert_eq!(
+        said(&[(0.0, "080#01"), (1.0, "080#02"), (2.0, "080#04"), (3.0, "080#01")]),
+        ["canopen ? SYNC: counter 1", "canopen ? SYNC: counter 4; frame 4 came instead of 3"]
+            .map(str::to_owned)
+    );
+}
+
+/// Any frames: no panic.
+#[test]
+fn any_frames_are_taken() {
+    let mut random = fastrand::Rng::with_seed(301);
+    let mut assembler = CanOpen::default();
+    let mut events = Vec::new();
+    for number in 0..300_000_u32 {
+        let id = random
+            .choice([0, 0x80, 0x85, 0x100, 0x185, 0x205, 0x585, 0x605, 0x605, 0x585, 0x705, 0x7E4, 0x7E5])
+            .unwrap();
+        let bytes: Vec<u8> =
+            (0..if random.u8(0..4) == 0 { random.usize(0..=8) } else { 8 }).map(|_| random.u8(..)).collect();
+        assembler.take(&at(f64::from(number) / 20.0, &format!("{id:03X}#{}", hex(&bytes))), &mut events);
+        for event in events.drain(..) {
+            let _ = event.to_string();
+        }
+    }
+    assembler.finish(&mut events);
+}

@@ -1,0 +1,65 @@
+//! What a transfer was.
+
+use super::pairs::Endpoint;
+use crate::Trouble;
+
+/// A message of one or many frames, or as much of it as there was.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Transfer {
+    /// The stamp of the last frame, or when it was given up, in nanoseconds.
+    pub time_ns: i64,
+    /// The stamp of the first frame.
+    pub start_ns: i64,
+    /// The channel, from 1.
+    pub channel: u8,
+    /// The sender.
+    pub from: Endpoint,
+    /// The receiver, where it is known and only one.
+    pub to: Option<Endpoint>,
+    /// The bytes.
+    pub data: Vec<u8>,
+    /// How many there should be.
+    pub length: u32,
+    /// The frames that it took, flow control included.
+    pub frames: u32,
+    /// What the receiver asked for last: frames until the next flow control.
+    pub block_size: Option<u8>,
+    /// What the receiver asked for last: microseconds between two frames.
+    pub separation_us: Option<u32>,
+    /// Flow control frames that asked to wait.
+    pub waits: u32,
+    /// Frames that came earlier than the receiver had asked for.
+    pub too_early: u32,
+    /// What went wrong.
+    pub trouble: Option<Trouble>,
+    /// Frames of the channel were lost meanwhile.
+    pub frames_lost: bool,
+}
+
+impl Transfer {
+    /// Whether all of it is there.
+    pub fn is_whole(&self) -> bool {
+        self.trouble.is_none()
+    }
+
+    /// Of no frames.
+    pub(super) const fn empty() -> Self {
+        let id = cantap_trace::Id::standard_truncated(0);
+        Self {
+            time_ns: 0,
+            start_ns: 0,
+            channel: 0,
+            from: Endpoint { id, address: None },
+            to: None,
+            data: Vec::new(),
+            length: 0,
+            frames: 0,
+            block_size: None,
+            separation_us: None,
+            waits: 0,
+            too_early: 0,
+            trouble: None,
+            frames_lost: false,
+        }
+    }
+}

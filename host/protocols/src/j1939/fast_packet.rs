@@ -1,0 +1,150 @@
+//! NMEA 2000's fast packets: up to 223 bytes in up to 32 frames.
+//!
+//! Memory: at most 256 under way, each with at most 223 bytes.
+
+use rustc_hash::FxHashMap;
+
+use super::header::Header;
+use super::transport::{Assembled, Way};
+use crate::Trouble;
+
+/// Between two frames of a packet.
+const NEXT_NS: i64 = 750_000_000;
+const SWEEP_NS: i64 = 100_000_000;
+const MOST_OPEN: usize = 256;
+const MOST_BYTES: u8 = 223;
+
+/// Channel, sender, receiver, group and the counter of the packet.
+type Key = (u8, u8, u8, u32, u8);
+
+/// Puts fast packets together.
+#[derive(Clone, Debug, Default)]
+pub struct FastPackets {
+    /// With the number of the next frame.
+    open: FxHashMap<Key, (Assembled, u8)>,
+    /// Packets that ended early, or whose beginning was not heard: the rest of each is told once.
+    headless: FxHashMap<Key, u8>,
+    sweep_ns: i64,
+}
+
+impl FastPackets {
+    /// Frames of the channel are missing.
+    pub fn interrupt(&mut self, channel: u8) {
+        for (message, _) in self.open.values_mut().filter(|(message, _)| message.channel == channel) {
+            message.frames_lost = true;
+        }
+    }
+
+    /// Ends what has waited for too long.
+    pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
+        if self.open.is_empty() || now_ns < self.sweep_ns {
+            return;
+        }
+        self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
+        let over = |message: &Assembled| now_ns.saturating_sub(message.time_ns) > NEXT_NS;
+        let mut late: Vec<_> =
+            self.open.extract_if(|_, (message, _)| over(message)).map(|(_, (message, _))| message).collect();
+        late.sort_by_key(|message| message.time_ns);
+        for mut message in late {
+            message.time_ns = message.time_ns.saturating_add(NEXT_NS);
+            let after_ms = (NEXT_NS / 1_000_000) as u32;
+            out(Assembled { trouble: Some(Trouble::Timeout { after_ms }), ..message });
+        }
+    }
+
+    /// The trace has ended.
+    pub fn finish(&mut self, out: &mut impl FnMut(Assembled)) {
+        let mut open: Vec<_> = self.open.drain().map(|(_, (message, _))| message).collect();
+        open.sort_by_key(|message| message.start_ns);
+        for message in open {
+            out(Assembled { trouble: Some(Trouble::Unfinished), ..message });
+        }
+    }
+
+    /// Takes a frame.
+    pub fn take(
+        &mut self,
+        channel: u8,
+        time_ns: i64,
+        header: Header,
+        data: &[u8],
+        out: &mut impl FnMut(Assembled),
+    ) {
+        let Some((&first, rest)) = data.split_first() else { return };
+        let (counter, number) = (first >> 5, first & 31);
+        let key = (channel, header.source, header.destination, header.pgn, counter);
+        let fresh = || Assembled {
+            time_ns,
+            start_ns: time_ns,
+            channel,
+            header,
+            way: Way::FastPacket,
+            data: Vec::new(),
+            size: 0,
+            frames: 1,
+            cleared_ns: None,
+            trouble: None,
+            frames_lost: false,
+        };
+        if number == 0 {
+            if !self.headless.is_empty() {
+                self.headless.remove(&key);
+            }
+            if let Some((before, _)) = self.open.remove(&key) {
+                out(Assembled { trouble: Some(Trouble::Overlapped), ..before });
+            }
+            let Some((&size, bytes)) = rest.split_first().filter(|(size, _)| **size <= MOST_BYTES) else {
+                let fault = "a fast packet has at most 223 bytes";
+                out(Assembled { data: data.to_vec(), trouble: Some(Trouble::Malformed(fault)), ..fresh() });
+                return;
+            };
+            let data = bytes[..bytes.len().min(usize::from(size))].to_vec();
+            let message = Assembled { size: size.into(), data, ..fresh() };
+            self.go_on(key, message, 1, out);
+            return;
+        }
+        let Some((mut message, next)) = self.open.remove(&key) else {
+            if self.headless.len() >= MOST_OPEN {
+                self.headless.clear();
+            }
+            if self.headless.insert(key, number).is_none_or(|before| before + 1 != number) {
+                out(Assembled { data: rest.to_vec(), trouble: Some(Trouble::Headless), ..fresh() });
+            }
+            return;
+        };
+        message.time_ns = time_ns;
+        message.frames += 1;
+        if number != next {
+            let trouble = Trouble::Sequence { expected: next.into(), got: number.into() };
+            self.headless.insert(key, number);
+            out(Assembled { trouble: Some(trouble), ..message });
+            return;
+        }
+        let missing = message.size as usize - message.data.len();
+        message.data.extend_from_slice(&rest[..rest.len().min(missing)]);
+        self.go_on(key, message, number + 1, out);
+    }
+
+    fn go_on(&mut self, key: Key, message: Assembled, next: u8, out: &mut impl FnMut(Assembled)) {
+        if message.data.len() == message.size as usize {
+            out(message);
+            return;
+        }
+        if next > 31 {
+            let fault = "a frame was shorter than its place";
+            out(Assembled { trouble: Some(Trouble::Malformed(fault)), ..message });
+            return;
+        }
+        if self.open.len() >= MOST_OPEN
+            && let Some(oldest) =
+                self.open.iter().min_by_key(|(_, (message, _))| message.time_ns).map(|(key, _)| *key)
+            && let Some((oldest, _)) = self.open.remove(&oldest)
+        {
+            out(Assembled { trouble: Some(Trouble::GivenUp), ..oldest });
+        }
+        if self.open.is_empty() {
+            self.sweep_ns = message.time_ns.saturating_add(SWEEP_NS);
+        }
+        self.open.insert(key, (message, next));
+    }
+}

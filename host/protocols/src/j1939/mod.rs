@@ -1,0 +1,396 @@
+//! SAE J1939: parameter groups, messages of many frames, address claims, requests, trouble codes; signals by a database.
+//!
+//! Memory: 256 messages of many frames under way, each with at most 64 KiB, 64 requests that wait, and a NAME for each of 254 addresses on each channel.
+
+mod fast_packet;
+mod header;
+mod name;
+mod names;
+#[cfg(test)]
+mod tests;
+pub(crate) mod transport;
+mod trouble_codes;
+
+pub use header::Header;
+
+use std::borrow::Cow;
+use std::collections::VecDeque;
+use std::sync::Arc;
+
+use cantap_signals::Decoder;
+use cantap_trace::{TraceFrame, TraceRecord};
+use rustc_hash::FxHashMap;
+
+use self::fast_packet::FastPackets;
+use self::header::{GLOBAL, NULL, party};
+use self::transport::{Assembled, LongMessages};
+use crate::nmea2000;
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+
+const REQUEST: u32 = 0xEA00;
+const ACKNOWLEDGEMENT: u32 = 0xE800;
+const ADDRESS_CLAIMED: u32 = 0xEE00;
+const COMMANDED_ADDRESS: u32 = 0xFED8;
+
+/// How long an answer to a request may take: T3 (J1939-21, 5.10.2.4).
+const ANSWER_NS: i64 = 1_250_000_000;
+const MOST_REQUESTS: usize = 64;
+
+/// A request for a parameter group.
+#[derive(Clone, Copy, Debug)]
+struct Request {
+    channel: u8,
+    time_ns: i64,
+    from: u8,
+    to: u8,
+    pgn: u32,
+    frames_lost: bool,
+    answered: bool,
+}
+
+/// Reads a J1939 bus, or one of NMEA 2000, which is J1939 with fast packets and its own parameter groups.
+#[derive(Default)]
+pub struct J1939 {
+    /// NMEA 2000's part.
+    marine: Option<FastPackets>,
+    transport: LongMessages,
+    requests: VecDeque<Request>,
+    names: FxHashMap<(u8, u8), u64>,
+    decoder: Option<Arc<Decoder>>,
+    messages: Vec<Assembled>,
+}
+
+impl J1939 {
+    /// With a database's signals, where there is one.
+    pub fn new(decoder: Option<Arc<Decoder>>) -> Self {
+        Self { decoder, ..Self::default() }
+    }
+
+    /// For NMEA 2000. A database's signals go before those that are known.
+    pub fn nmea2000(decoder: Option<Arc<Decoder>>) -> Self {
+        Self { marine: Some(FastPackets::default()), ..Self::new(decoder) }
+    }
+
+    const fn protocol(&self) -> Protocol {
+        if self.marine.is_some() { Protocol::Nmea2000 } else { Protocol::J1939 }
+    }
+
+    fn frame(&mut self, record: &TraceRecord, header: Header, data: &[u8], events: &mut Vec<Event>) {
+        let (channel, time_ns) = (record.channel, record.time_ns);
+        let mut messages = std::mem::take(&mut self.messages);
+        let mut out = |message| messages.push(message);
+        let taken = match header.pgn {
+            transport::CONTROL | transport::EXTENDED_CONTROL => {
+                self.transport.control(channel, time_ns, header, data, &mut out)
+            }
+            transport::DATA | transport::EXTENDED_DATA => {
+                if self.transport.data(channel, time_ns, header, data, &mut out) {
+                    Ok(())
+                } else {
+                    // Told once for each message: its first frame, or the one behind a gap, is enough.
+                    let mut event = self.event(record, header, "broken");
+                    event.trouble = Some(Trouble::Headless);
+                    events.push(event);
+                    Ok(())
+                }
+            }
+            _ => {
+                match &mut self.marine {
+                    Some(packets) if nmea2000::is_fast(header.pgn) => {
+                        packets.take(channel, time_ns, header, data, &mut out);
+                    }
+                    _ => self.message(record, header, data, None, events),
+                }
+                Ok(())
+            }
+        };
+        if let Err(fault) = taken {
+            let mut event = self.event(record, header, "broken");
+            event.trouble = Some(Trouble::Malformed(fault));
+            events.push(event);
+        }
+        for message in messages.drain(..) {
+            self.assembled(record, message, events);
+        }
+        self.messages = messages;
+    }
+
+    /// A message of many frames has ended.
+    fn assembled(&mut self, record: &TraceRecord, mut message: Assembled, events: &mut Vec<Event>) {
+        let data = std::mem::take(&mut message.data);
+        let record = TraceRecord { time_ns: message.time_ns, channel: message.channel, ..*record };
+        self.message(&record, message.header, &data, Some(&message), events);
+    }
+
+    fn event(&self, record: &TraceRecord, header: Header, kind: &'static str) -> Event {
+        let title =
+            names::group(header.pgn).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
+        let mut event = Event::new(self.protocol(), record, kind, title);
+        (event.from, event.to) = (party(header.source), party(header.destination));
+        event.fields.reserve(4);
+        event.fields.push(Field::number("pgn", header.pgn));
+        event.fields.push(Field::number("priority", header.priority));
+        event
+    }
+
+    fn message(
+        &mut self,
+        record: &TraceRecord,
+        header: Header,
+        data: &[u8],
+        long: Option<&Assembled>,
+        events: &mut Vec<Event>,
+    ) {
+        let mut event = self.event(record, header, "message");
+        let mut asked = None;
+        if let Some(long) = long {
+            event.start_ns = long.start_ns;
+            event.frames = long.frames;
+            event.frames_lost = long.frames_lost;
+            event.trouble = long.trouble;
+            event.data = data.to_vec();
+            event.fields.push(Field::text("transport", long.way.name()));
+            event.fields.push(Field::number("length", long.size).unit("bytes"));
+            if let Some(cleared_ns) = long.cleared_ns {
+                event.fields.push(Field::real("rts_to_cts_ms", cleared_ns as f64 / 1e6, "ms"));
+            }
+            if long.trouble.is_some() {
+                event.kind = "broken";
+                event.fields.push(Field::number("received", data.len() as i64).unit("bytes"));
+                events.push(event);
+                return;
+            }
+        }
+        match (header.pgn, data) {
+            (REQUEST, [a, b, c, ..]) => {
+                let pgn = header::pgn([*a, *b, *c]);
+                event.kind = "request";
+                event.fields.push(Field::number("requested", pgn).meaning(names::group(pgn)));
+                self.ask(record, header, pgn, events);
+            }
+            (ACKNOWLEDGEMENT, [control, function, _, _, address, a, b, c]) => {
+                let pgn = header::pgn([*a, *b, *c]);
+                event.kind = "acknowledgement";
+                let said = ["yes", "no", "access denied", "cannot respond now"];
+                let said = said.get(usize::from(*control)).copied();
+                event.fields.push(Field::number("control", *control).meaning(said));
+                event.fields.push(Field::number("group_function", *function));
+                event.fields.push(Field::number("requested", pgn).meaning(names::group(pgn)));
+                if *address < NULL {
+                    event.fields.push(Field::number("of", *address));
+                }
+                asked = Some(pgn);
+            }
+            (ADDRESS_CLAIMED, data) if data.len() == 8 => {
+                self.claim(record.channel, header, u64_of(data), &mut event);
+            }
+            (COMMANDED_ADDRESS, [name @ .., address]) if name.len() == 8 => {
+                event.kind = "address_command";
+                event.fields.push(Field::number("address", *address));
+                name::fields(u64_of(name), &mut event.fields);
+            }
+            (pgn, data) if trouble_codes::carries(pgn) => {
+                event.kind = "trouble_codes";
+                trouble_codes::fields(data, &mut event.fields);
+            }
+            (0xFEDA | 0xFEEB | 0xFEEC, data) => {
+                let name = if header.pgn == 0xFEEC { "vin" } else { "text" };
+                let text = data
+                    .iter()
+                    .take_while(|byte| **byte != 0 && **byte != 0xFF)
+                    .map(|byte| char::from(*byte));
+                let text: String = text.filter(|letter| !letter.is_control()).collect();
+                event.fields.push(Field::text(name, text.trim_end_matches('*').to_owned()));
+            }
+            (_, data) => {
+                if !self.signals(record.channel, header, data, &mut event)
+                    && !self.marine_fields(header, data, &mut event)
+                {
+                    event.fields.push(Field::bytes("data", data));
+                }
+            }
+        }
+        self.answer(record.channel, header, asked.unwrap_or(header.pgn), &mut event);
+        events.push(event);
+    }
+
+    /// A database's signals; false if it does not know the group.
+    fn signals(&self, channel: u8, header: Header, data: &[u8], event: &mut Event) -> bool {
+        let Some(decoder) = &self.decoder else { return false };
+        let Some(reference) = decoder.find(channel, header.id()) else { return false };
+        let message = decoder.message(reference);
+        let mut values = Vec::new();
+        decoder.decode_data(reference, data, &mut values);
+        event.title = message.name.clone().into();
+        for value in &values {
+            let signal = &message.signals[value.signal as usize];
+            let name: Cow<'static, str> = signal.label().into_owned().into();
+            event.fields.push(match message.indicator(signal, value.raw) {
+                Some(indicator) => Field::missing(name).meaning(Some(indicator.name())),
+                None => Field::real(name, value.value, signal.unit.clone())
+                    .meaning(signal.text(value.raw).map(str::to_owned)),
+            });
+        }
+        true
+    }
+
+    /// What NMEA 2000 has of it; false if it is not known.
+    fn marine_fields(&self, header: Header, data: &[u8], event: &mut Event) -> bool {
+        if self.marine.is_none() {
+            return false;
+        }
+        let before = event.fields.len();
+        if let Some(title) = nmea2000::describe(header.pgn, data, &mut event.fields) {
+            event.title = title;
+        }
+        event.fields.len() > before
+    }
+
+    fn claim(&mut self, channel: u8, header: Header, name: u64, event: &mut Event) {
+        event.kind = "address_claim";
+        if header.source == NULL {
+            event.title = "cannot claim an address".into();
+        }
+        name::fields(name, &mut event.fields);
+        if header.source >= NULL {
+            return;
+        }
+        let known = self.names.entry((channel, header.source)).or_insert(name);
+        if *known != name {
+            // The lower NAME has priority (J1939-81, 4.4.3.3).
+            let (winner, loser) = if name < *known { (name, *known) } else { (*known, name) };
+            *known = winner;
+            event.fields.push(Field::hex("address_lost_by", loser, 16));
+        }
+    }
+
+    fn ask(&mut self, record: &TraceRecord, header: Header, pgn: u32, events: &mut Vec<Event>) {
+        if self.requests.len() == MOST_REQUESTS
+            && let Some(oldest) = self.requests.pop_front()
+        {
+            self.unanswered(oldest, Trouble::GivenUp, record, events);
+        }
+        self.requests.push_back(Request {
+            channel: record.channel,
+            time_ns: record.time_ns,
+            from: header.source,
+            to: header.destination,
+            pgn,
+            frames_lost: false,
+            answered: false,
+        });
+    }
+
+    /// Whether the message is what somebody asked for, and how long ago.
+    fn answer(&mut self, channel: u8, header: Header, pgn: u32, event: &mut Event) {
+        if self.requests.is_empty() {
+            return;
+        }
+        let asked = self.requests.iter_mut().find(|request| {
+            request.channel == channel
+                && request.pgn == pgn
+                && request.from != header.source
+                && (request.to == header.source || request.to == GLOBAL)
+                && (header.destination == GLOBAL || header.destination == request.from)
+        });
+        if let Some(request) = asked {
+            event.response_ns = Some(event.start_ns.saturating_sub(request.time_ns));
+            event.frames_lost |= request.frames_lost;
+            request.answered = true;
+            if request.to != GLOBAL {
+                let to = request.to;
+                self.requests.retain(|request| !(request.answered && request.to == to));
+            }
+        }
+    }
+
+    /// To all there need not be an answer.
+    fn unanswered(&self, request: Request, trouble: Trouble, record: &TraceRecord, events: &mut Vec<Event>) {
+        if request.answered || request.to == GLOBAL {
+            return;
+        }
+        let header = Header { priority: 6, pgn: REQUEST, source: request.from, destination: request.to };
+        let mut event = self.event(record, header, "no_response");
+        event.fields.pop();
+        event.channel = request.channel;
+        event.start_ns = request.time_ns;
+        if let Trouble::Timeout { .. } = trouble {
+            event.time_ns = request.time_ns.saturating_add(ANSWER_NS);
+        }
+        event.data.clear();
+        event.fields.push(Field::number("requested", request.pgn).meaning(names::group(request.pgn)));
+        event.fields.push(Field::text("response", "none"));
+        event.trouble = Some(trouble);
+        event.frames_lost = request.frames_lost;
+        events.push(event);
+    }
+}
+
+/// Whether the group is one that J1939 gives a meaning and that diagnostics by ISO 15765 do not use.
+pub(crate) fn is_known(pgn: u32) -> bool {
+    !matches!(pgn, 0xDA00 | 0xDB00) && pgn < 0xFF00 && names::group(pgn).is_some()
+}
+
+fn u64_of(bytes: &[u8]) -> u64 {
+    bytes.iter().rev().fold(0, |number, byte| number << 8 | u64::from(*byte))
+}
+
+impl Assembler for J1939 {
+    fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
+        while let Some(request) = self.requests.front()
+            && record.time_ns.saturating_sub(request.time_ns) > ANSWER_NS
+        {
+            if let Some(request) = self.requests.pop_front() {
+                let after_ms = (ANSWER_NS / 1_000_000) as u32;
+                self.unanswered(request, Trouble::Timeout { after_ms }, record, events);
+            }
+        }
+        let mut messages = std::mem::take(&mut self.messages);
+        self.transport.advance(record.time_ns, &mut |message| messages.push(message));
+        if let Some(packets) = &mut self.marine {
+            packets.advance(record.time_ns, &mut |message| messages.push(message));
+        }
+        for message in messages.drain(..) {
+            self.assembled(record, message, events);
+        }
+        self.messages = messages;
+        if is_gap(&record.event) {
+            self.transport.interrupt(record.channel);
+            if let Some(packets) = &mut self.marine {
+                packets.interrupt(record.channel);
+            }
+            for request in self.requests.iter_mut().filter(|request| request.channel == record.channel) {
+                request.frames_lost = true;
+            }
+        }
+        let Some(frame) = record.frame().filter(|frame| !frame.is_remote()) else { return };
+        let Some(header) = Header::of(TraceFrame::id(frame)) else { return };
+        self.frame(record, header, frame.data(), events);
+    }
+
+    fn finish(&mut self, events: &mut Vec<Event>) {
+        let mut messages = Vec::new();
+        self.transport.finish(&mut |message| messages.push(message));
+        if let Some(packets) = &mut self.marine {
+            packets.finish(&mut |message| messages.push(message));
+        }
+        let record = TraceRecord { time_ns: 0, channel: 1, event: cantap_trace::TraceEvent::GAP };
+        for message in messages {
+            self.assembled(&record, message, events);
+        }
+        for request in std::mem::take(&mut self.requests) {
+            let record = TraceRecord { time_ns: request.time_ns, ..record };
+            self.unanswered(request, Trouble::Unfinished, &record, events);
+        }
+    }
+}
+
+impl Party {
+    /// The node's address, if it is one.
+    pub const fn node(self) -> Option<u8> {
+        match self {
+            Self::Node(node) => Some(node),
+            _ => None,
+        }
+    }
+}

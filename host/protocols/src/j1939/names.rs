@@ -1,0 +1,139 @@
+//! Parameter groups and failure modes by name.
+
+/// Names of groups that a bus is likely to carry (SAE J1939-71 and -73 by their public acronyms).
+const GROUPS: [(u32, &str); 77] = [
+    (0x0000, "TSC1 torque/speed control"),
+    (0x0100, "TC1 transmission control"),
+    (0xC700, "ETP.DT"),
+    (0xC800, "ETP.CM"),
+    (0xD700, "DM16 binary data transfer"),
+    (0xD800, "DM15 memory access response"),
+    (0xD900, "DM14 memory access request"),
+    (0xDA00, "diagnostics by ISO 15765"),
+    (0xDB00, "diagnostics by ISO 15765, to all"),
+    (0xDF00, "DM13 stop start broadcast"),
+    (0xE800, "acknowledgement"),
+    (0xEA00, "request"),
+    (0xEB00, "TP.DT"),
+    (0xEC00, "TP.CM"),
+    (0xEE00, "address claimed"),
+    (0xEF00, "proprietary A"),
+    (0x1_EF00, "proprietary A2"),
+    (0xF000, "ERC1 retarder"),
+    (0xF001, "EBC1 brakes"),
+    (0xF002, "ETC1 transmission"),
+    (0xF003, "EEC2 engine"),
+    (0xF004, "EEC1 engine"),
+    (0xF005, "ETC2 transmission"),
+    (0xF006, "EAC1 axle"),
+    (0xF009, "VDC2 vehicle dynamics"),
+    (0xF00A, "EGF1 engine gas flow rate"),
+    (0xFD7C, "DPFC1 particulate filter control"),
+    (0xFDC5, "ECU identification"),
+    (0xFE4E, "door control 1"),
+    (0xFE4F, "VDC1 vehicle dynamics stability control"),
+    (0xFE56, "AT1T1I aftertreatment tank"),
+    (0xFE6C, "TCO1 tachograph"),
+    (0xFE70, "CVW combination vehicle weight"),
+    (0xFEAE, "AIR1 air supply pressure"),
+    (0xFEAF, "GFC fuel consumption, gaseous"),
+    (0xFEB0, "engine hours, revolutions, idle"),
+    (0xFEBD, "FD fan drive"),
+    (0xFEBF, "EBC2 wheel speeds"),
+    (0xFEC0, "SERV service"),
+    (0xFEC1, "VDHR high resolution vehicle distance"),
+    (0xFECA, "DM1 active trouble codes"),
+    (0xFECB, "DM2 previously active trouble codes"),
+    (0xFECC, "DM3 clear previously active trouble codes"),
+    (0xFECD, "DM4 freeze frame"),
+    (0xFECE, "DM5 diagnostic readiness"),
+    (0xFECF, "DM6 pending trouble codes"),
+    (0xFED0, "DM8 test results"),
+    (0xFED3, "DM11 clear active trouble codes"),
+    (0xFED4, "DM12 emission-related active trouble codes"),
+    (0xFED8, "commanded address"),
+    (0xFEDA, "SOFT software identification"),
+    (0xFEDB, "EFL/P2 engine fluid level and pressure"),
+    (0xFEDC, "IO idle operation"),
+    (0xFEDF, "EEC3 engine"),
+    (0xFEE0, "VD vehicle distance"),
+    (0xFEE1, "RC retarder configuration"),
+    (0xFEE2, "TCFG transmission configuration"),
+    (0xFEE3, "EC1 engine configuration"),
+    (0xFEE4, "SHUTDN shutdown"),
+    (0xFEE5, "HOURS engine hours, revolutions"),
+    (0xFEE6, "TD time and date"),
+    (0xFEE8, "VDS vehicle direction and speed"),
+    (0xFEE9, "LFC fuel consumption, liquid"),
+    (0xFEEA, "VW vehicle weight"),
+    (0xFEEB, "CI component identification"),
+    (0xFEEC, "VI vehicle identification"),
+    (0xFEEE, "ET1 engine temperature"),
+    (0xFEEF, "EFL/P1 engine fluid level and pressure"),
+    (0xFEF0, "PTO power take-off"),
+    (0xFEF1, "CCVS1 cruise control and vehicle speed"),
+    (0xFEF2, "LFE1 fuel economy, liquid"),
+    (0xFEF3, "VP vehicle position"),
+    (0xFEF5, "AMB ambient conditions"),
+    (0xFEF6, "IC1 inlet and exhaust conditions"),
+    (0xFEF7, "VEP1 vehicle electrical power"),
+    (0xFEF8, "TRF1 transmission fluids"),
+    (0xFEFC, "DD1 dash display"),
+];
+
+/// A parameter group's name.
+pub fn group(pgn: u32) -> Option<&'static str> {
+    let place = GROUPS.binary_search_by_key(&order(pgn), |(known, _)| order(*known)).ok();
+    place.map(|place| GROUPS[place].1).or(match pgn {
+        0xFF00..=0xFFFF => Some("proprietary B"),
+        0x1_FF00..=0x1_FFFF => Some("proprietary B2"),
+        _ => None,
+    })
+}
+
+/// The table is by the low 16 bits, so that pages stand together.
+const fn order(pgn: u32) -> u32 {
+    (pgn & 0xFFFF) << 2 | pgn >> 16
+}
+
+/// Failure mode identifiers (SAE J1939-73, appendix A).
+pub const fn failure_mode(fmi: u8) -> &'static str {
+    match fmi {
+        0 => "above normal range, most severe",
+        1 => "below normal range, most severe",
+        2 => "erratic, intermittent or incorrect",
+        3 => "voltage above normal or shorted high",
+        4 => "voltage below normal or shorted low",
+        5 => "current below normal or open circuit",
+        6 => "current above normal or grounded circuit",
+        7 => "mechanical system not responding or out of adjustment",
+        8 => "abnormal frequency, pulse width or period",
+        9 => "abnormal update rate",
+        10 => "abnormal rate of change",
+        11 => "root cause not known",
+        12 => "bad intelligent device or component",
+        13 => "out of calibration",
+        14 => "special instructions",
+        15 => "above normal range, least severe",
+        16 => "above normal range, moderately severe",
+        17 => "below normal range, least severe",
+        18 => "below normal range, moderately severe",
+        19 => "received network data in error",
+        20 => "drifted high",
+        21 => "drifted low",
+        31 => "condition exists",
+        _ => "reserved",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn groups_are_in_order() {
+        assert!(GROUPS.is_sorted_by_key(|(pgn, _)| order(*pgn)));
+        assert_eq!(group(0xF004), Some("EEC1 engine"));
+        assert_eq!(group(0x1_EF00), Some("proprietary A2"));
+    }
+}

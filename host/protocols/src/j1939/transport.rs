@@ -1,0 +1,299 @@
+//! Messages of many frames: SAE J1939-21's transport protocol, and ISO 11783-3's extended one.
+//!
+//! Memory: at most 256 under way, each with at most 64 KiB.
+
+use rustc_hash::FxHashMap;
+
+use super::header::{GLOBAL, Header, pgn};
+use crate::Trouble;
+
+/// TP.CM, TP.DT, ETP.CM, ETP.DT.
+pub const CONTROL: u32 = 0xEC00;
+pub const DATA: u32 = 0xEB00;
+pub const EXTENDED_CONTROL: u32 = 0xC800;
+pub const EXTENDED_DATA: u32 = 0xC700;
+
+/// Between two frames of a broadcast: T1 (J1939-21, 5.10.2.4).
+const BROADCAST_NS: i64 = 750_000_000;
+/// While one side waits for the other: T2 and T3.
+const PEER_NS: i64 = 1_250_000_000;
+const SWEEP_NS: i64 = 100_000_000;
+const MOST_OPEN: usize = 256;
+const MOST_BYTES: usize = 1 << 16;
+
+/// How a message of many frames was sent.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Way {
+    /// To all, without an answer.
+    Broadcast,
+    /// To one, who says when to send.
+    Connection,
+    /// The same for more than 1785 bytes.
+    Extended,
+    /// NMEA 2000's fast packets.
+    FastPacket,
+}
+
+impl Way {
+    /// For people.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Broadcast => "BAM",
+            Self::Connection => "RTS/CTS",
+            Self::Extended => "ETP",
+            Self::FastPacket => "fast packet",
+        }
+    }
+}
+
+/// A message, whole or as far as it came.
+#[derive(Clone, Debug)]
+pub struct Assembled {
+    pub time_ns: i64,
+    pub start_ns: i64,
+    pub channel: u8,
+    /// Of the message itself.
+    pub header: Header,
+    pub way: Way,
+    pub data: Vec<u8>,
+    /// How many bytes there should be.
+    pub size: u32,
+    pub frames: u32,
+    /// From the request to send to the first clear to send, in nanoseconds.
+    pub cleared_ns: Option<i64>,
+    pub trouble: Option<Trouble>,
+    pub frames_lost: bool,
+}
+
+/// One under way.
+#[derive(Clone, Debug)]
+pub(super) struct Open {
+    pub message: Assembled,
+    /// The next frame, from 1 (of the whole message).
+    pub next: u32,
+    /// Frames that were told to come before the window of an extended transfer.
+    offset: u32,
+    /// A frame came out of order, and the receiver has not asked for it again so far.
+    gap: Option<Trouble>,
+}
+
+/// Puts messages together.
+#[derive(Clone, Debug, Default)]
+pub struct LongMessages {
+    open: FxHashMap<(u8, u8, u8, bool), Open>,
+    sweep_ns: i64,
+}
+
+/// Why a connection was aborted (J1939-21, table 7).
+fn reason(code: u8) -> &'static str {
+    match code {
+        1 => "the receiver has as many connections as it can",
+        2 => "resources are needed for another task",
+        3 => "timeout",
+        4 => "clear to send while data was being sent",
+        5 => "too many retransmissions",
+        6 => "unexpected data frame",
+        7 => "bad sequence number",
+        8 => "sequence number twice",
+        9 => "too long for the receiver",
+        250 => "another reason",
+        _ => "unknown reason",
+    }
+}
+
+impl LongMessages {
+    /// Frames of the channel are missing.
+    pub fn interrupt(&mut self, channel: u8) {
+        for open in self.open.values_mut().filter(|open| open.message.channel == channel) {
+            open.message.frames_lost = true;
+        }
+    }
+
+    /// Ends what has waited for too long.
+    pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
+        if self.open.is_empty() || now_ns < self.sweep_ns {
+            return;
+        }
+        self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
+        let patience = |open: &Open| match open.message.way {
+            Way::Broadcast => BROADCAST_NS,
+            _ => PEER_NS,
+        };
+        let over = |open: &Open| now_ns.saturating_sub(open.message.time_ns) > patience(open);
+        let mut late: Vec<_> = self.open.extract_if(|_, open| over(open)).map(|(_, open)| open).collect();
+        late.sort_by_key(|open| open.message.time_ns);
+        for mut open in late {
+            let patience = patience(&open);
+            open.message.time_ns = open.message.time_ns.saturating_add(patience);
+            end(open, Trouble::Timeout { after_ms: (patience / 1_000_000) as u32 }, out);
+        }
+    }
+
+    /// The trace has ended.
+    pub fn finish(&mut self, out: &mut impl FnMut(Assembled)) {
+        let mut open: Vec<_> = self.open.drain().map(|(_, open)| open).collect();
+        open.sort_by_key(|open| open.message.start_ns);
+        for open in open {
+            end(open, Trouble::Unfinished, out);
+        }
+    }
+
+    fn begin(&mut self, key: (u8, u8, u8, bool), open: Open, out: &mut impl FnMut(Assembled)) {
+        if let Some(before) = self.open.remove(&key) {
+            end(before, Trouble::Overlapped, out);
+        }
+        if self.open.len() >= MOST_OPEN
+            && let Some(oldest) =
+                self.open.iter().min_by_key(|(_, open)| open.message.time_ns).map(|(key, _)| *key)
+            && let Some(oldest) = self.open.remove(&oldest)
+        {
+            end(oldest, Trouble::GivenUp, out);
+        }
+        if self.open.is_empty() {
+            self.sweep_ns = open.message.time_ns.saturating_add(SWEEP_NS);
+        }
+        self.open.insert(key, open);
+    }
+
+    /// Takes a frame of connection management.
+    pub fn control(
+        &mut self,
+        channel: u8,
+        time_ns: i64,
+        header: Header,
+        data: &[u8],
+        out: &mut impl FnMut(Assembled),
+    ) -> Result<(), &'static str> {
+        let extended = header.pgn == EXTENDED_CONTROL;
+        let &[control, a, b, c, d, e, f, g] = data else {
+            return Err("connection management has 8 bytes");
+        };
+        let (source, destination) = (header.source, header.destination);
+        let of = Header { pgn: pgn([e, f, g]), ..header };
+        // What the receiver says is about the message that goes the other way.
+        let back = (channel, destination, source, extended);
+        let message = Assembled {
+            time_ns,
+            start_ns: time_ns,
+            channel,
+            header: of,
+            way: Way::Connection,
+            data: Vec::new(),
+            size: u32::from(u16::from_le_bytes([a, b])),
+            frames: 1,
+            cleared_ns: None,
+            trouble: None,
+            frames_lost: false,
+        };
+        let open = |message| Open { message, next: 1, offset: 0, gap: None };
+        match (control, extended) {
+            (16 | 32, false) => {
+                if message.size == 0 || u32::from(c) != message.size.div_ceil(7) {
+                    return Err("the number of frames does not suit the number of bytes");
+                }
+                let way = if control == 32 { Way::Broadcast } else { Way::Connection };
+                let destination = if control == 32 { GLOBAL } else { destination };
+                self.begin((channel, source, destination, false), open(Assembled { way, ..message }), out);
+            }
+            (20, true) => {
+                let size = u32::from_le_bytes([a, b, c, d]);
+                let message = Assembled { way: Way::Extended, size, ..message };
+                self.begin((channel, source, destination, true), open(message), out);
+            }
+            (17 | 21, _) => {
+                let Some(open) = self.open.get_mut(&back) else { return Ok(()) };
+                let message = &mut open.message;
+                (message.time_ns, message.frames) = (time_ns, message.frames + 1);
+                message.cleared_ns.get_or_insert(time_ns.saturating_sub(message.start_ns));
+                let next = if extended { u32::from_le_bytes([b, c, d, 0]) } else { u32::from(b) };
+                // The receiver may want frames again; a pause (0 frames) names none.
+                if a > 0 && (1..open.next).contains(&next) {
+                    open.next = next;
+                    message.data.truncate((next as usize - 1) * 7);
+                }
+                if a > 0 {
+                    open.gap = None;
+                }
+            }
+            (22, true) => {
+                let forward = (channel, source, destination, true);
+                let Some(open) = self.open.get_mut(&forward) else { return Ok(()) };
+                open.offset = u32::from_le_bytes([b, c, d, 0]);
+                open.message.frames += 1;
+                open.message.time_ns = time_ns;
+            }
+            (19 | 23, _) => {
+                // All that had arrived was handed out with its last frame; what is still here was not heard whole.
+                if let Some(mut open) = self.open.remove(&back) {
+                    open.message.time_ns = time_ns;
+                    let got = open.message.data.len().div_ceil(7) as u32 + 1;
+                    let trouble = open.gap.unwrap_or(Trouble::Sequence { expected: open.next, got });
+                    end(open, trouble, out);
+                }
+            }
+            (255, _) => {
+                let forward = (channel, source, destination, extended);
+                let found = self.open.remove(&back).or_else(|| self.open.remove(&forward));
+                if let Some(mut open) = found {
+                    open.message.time_ns = time_ns;
+                    open.message.frames += 1;
+                    end(open, Trouble::Aborted(reason(a)), out);
+                } else {
+                    out(Assembled { trouble: Some(Trouble::Aborted(reason(a))), size: 0, ..message });
+                }
+            }
+            _ => return Err("connection management of unknown kind"),
+        }
+        Ok(())
+    }
+
+    /// Takes a data frame; false if it belongs to nothing that is under way.
+    pub fn data(
+        &mut self,
+        channel: u8,
+        time_ns: i64,
+        header: Header,
+        data: &[u8],
+        out: &mut impl FnMut(Assembled),
+    ) -> bool {
+        let key = (channel, header.source, header.destination, header.pgn == EXTENDED_DATA);
+        let Some(open) = self.open.get_mut(&key) else { return false };
+        let Some((&sequence, bytes)) = data.split_first() else { return true };
+        let message = &mut open.message;
+        (message.time_ns, message.frames) = (time_ns, message.frames + 1);
+        let number = open.offset + u32::from(sequence);
+        if number != open.next {
+            let trouble = Trouble::Sequence { expected: open.next, got: number };
+            if message.way == Way::Broadcast {
+                if let Some(open) = self.open.remove(&key) {
+                    end(open, trouble, out);
+                }
+            } else {
+                // A receiver that misses it too asks for it again.
+                open.gap.get_or_insert(trouble);
+            }
+            return true;
+        }
+        open.next += 1;
+        let size = message.size as usize;
+        let missing = size.saturating_sub((number as usize - 1) * 7);
+        let room = MOST_BYTES.saturating_sub(message.data.len());
+        message.data.extend_from_slice(&bytes[..bytes.len().min(missing).min(room)]);
+        if number as usize >= size.div_ceil(7)
+            && let Some(open) = self.open.remove(&key)
+        {
+            if open.message.data.len() == size {
+                out(open.message);
+            } else if size > MOST_BYTES {
+                end(open, Trouble::Cut, out);
+            } else {
+                end(open, Trouble::Malformed("a frame was shorter than its place"), out);
+            }
+        }
+        true
+    }
+}
+
+fn end(open: Open, trouble: Trouble, out: &mut impl FnMut(Assembled)) {
+    out(Assembled { trouble: Some(trouble), ..open.message });
+}

@@ -1,0 +1,48 @@
+//! DM1 and its relatives: lamps and trouble codes (SAE J1939-73).
+
+use std::fmt::Write as _;
+
+use super::names::failure_mode;
+use crate::Field;
+
+/// Whether the group carries lamps and codes as DM1 does.
+pub const fn carries(pgn: u32) -> bool {
+    matches!(pgn, 0xFECA | 0xFECB | 0xFECF | 0xFED4)
+}
+
+/// Lamps, then codes.
+pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
+    let &[lamps, flashing, ref codes @ ..] = data else { return };
+    for (shift, name) in
+        [(6, "malfunction_lamp"), (4, "red_stop_lamp"), (2, "amber_warning_lamp"), (0, "protect_lamp")]
+    {
+        let state = match (lamps >> shift & 3, flashing >> shift & 3) {
+            (1, 0) => "on, flashing slowly",
+            (1, 1) => "on, flashing fast",
+            (1, _) => "on",
+            (0, _) => "off",
+            _ => continue,
+        };
+        fields.push(Field::text(name, state));
+    }
+    let mut text = String::new();
+    let mut count = 0;
+    for code in codes.chunks_exact(4).filter(|code| **code != [0; 4] && **code != [0xFF; 4]) {
+        let spn = u32::from(code[0]) | u32::from(code[1]) << 8 | u32::from(code[2] >> 5) << 16;
+        let (fmi, times) = (code[2] & 31, code[3] & 0x7F);
+        // Writing to a String cannot fail.
+        let _ =
+            write!(text, "{}SPN {spn} FMI {fmi} ({})", if count == 0 { "" } else { ", " }, failure_mode(fmi));
+        if times != 0x7F {
+            let _ = write!(text, " {times} times");
+        }
+        if code[3] & 0x80 != 0 {
+            text.push_str(" in an old conversion, whose number may be another");
+        }
+        count += 1;
+    }
+    fields.push(Field::number("trouble_codes", count));
+    if count > 0 {
+        fields.push(Field::text("codes", text));
+    }
+}

@@ -1,0 +1,228 @@
+//! CANboat's database of parameter groups, in `data/`.
+
+use std::io::Read;
+use std::sync::OnceLock;
+
+use rustc_hash::FxHashMap;
+use serde::Deserialize;
+
+/// The database as its project publishes it.
+const COMPRESSED: &[u8] = include_bytes!("../../data/canboat.json.gz");
+
+/// All groups and the tables that their fields refer to.
+#[derive(Debug, Default)]
+pub struct Database {
+    /// By number, then in the order of the file.
+    groups: Vec<Group>,
+    pub lookups: FxHashMap<String, FxHashMap<u64, String>>,
+    pub bits: FxHashMap<String, FxHashMap<u64, String>>,
+    /// By the other field's value and this one's.
+    pub indirect: FxHashMap<String, FxHashMap<(u64, u64), String>>,
+    pub kinds: FxHashMap<String, FxHashMap<u64, Key>>,
+    /// How many entries of the file there were.
+    #[cfg(test)]
+    pub entries: usize,
+}
+
+/// A group, or one of several that share a number.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "PascalCase")]
+pub struct Group {
+    #[serde(rename = "PGN")]
+    pub pgn: u32,
+    pub description: String,
+    #[serde(rename = "Type")]
+    pub kind: String,
+    #[serde(default)]
+    pub fallback: bool,
+    pub fields: Vec<FieldKind>,
+    #[serde(rename = "RepeatingFieldSet1Size", default)]
+    pub set_1_size: usize,
+    #[serde(rename = "RepeatingFieldSet1StartField", default)]
+    pub set_1_start: usize,
+    #[serde(rename = "RepeatingFieldSet1CountField", default)]
+    pub set_1_count: usize,
+    #[serde(rename = "RepeatingFieldSet2Size", default)]
+    pub set_2_size: usize,
+    #[serde(rename = "RepeatingFieldSet2StartField", default)]
+    pub set_2_start: usize,
+    #[serde(rename = "RepeatingFieldSet2CountField", default)]
+    pub set_2_count: usize,
+}
+
+/// How a field's bits are to be read.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Deserialize)]
+#[serde(rename_all = "SCREAMING_SNAKE_CASE")]
+pub enum Kind {
+    Number,
+    Lookup,
+    Reserved,
+    Binary,
+    Duration,
+    StringLau,
+    Spare,
+    StringFix,
+    Mmsi,
+    Bitlookup,
+    Time,
+    StringLz,
+    Date,
+    Pgn,
+    IsoName,
+    FieldIndex,
+    Variable,
+    Float,
+    Decimal,
+    DynamicFieldKey,
+    DynamicFieldValue,
+    IndirectLookup,
+    DynamicFieldLength,
+    #[serde(other)]
+    Unknown,
+}
+
+/// A field of a group.
+#[derive(Clone, Debug, Deserialize)]
+#[serde(rename_all = "PascalCase")]
+pub struct FieldKind {
+    pub name: String,
+    pub field_type: Kind,
+    #[serde(default)]
+    pub bit_length: usize,
+    pub bit_offset: Option<usize>,
+    #[serde(default)]
+    pub bit_length_variable: bool,
+    pub resolution: Option<f64>,
+    #[serde(default)]
+    pub signed: bool,
+    #[serde(default)]
+    pub offset: f64,
+    pub range_max: Option<f64>,
+    #[serde(default)]
+    pub unit: String,
+    #[serde(rename = "Match")]
+    pub wanted: Option<u64>,
+    pub lookup_enumeration: Option<String>,
+    pub lookup_bit_enumeration: Option<String>,
+    pub lookup_indirect_enumeration: Option<String>,
+    pub lookup_indirect_enumeration_field_order: Option<usize>,
+    pub lookup_field_type_enumeration: Option<String>,
+}
+
+/// What a key of a key and its value stands for.
+#[derive(Debug, Deserialize)]
+#[serde(rename_all = "PascalCase")]
+pub struct Key {
+    #[serde(rename = "name")]
+    pub name: String,
+    #[serde(rename = "value")]
+    pub value: u64,
+    pub field_type: Kind,
+    pub resolution: Option<f64>,
+    #[serde(default)]
+    pub unit: String,
+    #[serde(default)]
+    pub bits: String,
+    #[serde(default)]
+    pub signed: bool,
+    pub lookup_enumeration: Option<String>,
+    pub lookup_bit_enumeration: Option<String>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(rename_all = "PascalCase", default)]
+struct File {
+    #[serde(rename = "PGNs")]
+    groups: Vec<Group>,
+    lookup_enumerations: Vec<Table>,
+    lookup_bit_enumerations: Vec<Table>,
+    lookup_indirect_enumerations: Vec<Table>,
+    lookup_field_type_enumerations: Vec<Table>,
+}
+
+#[derive(Default, Deserialize)]
+#[serde(rename_all = "PascalCase", default)]
+struct Table {
+    name: String,
+    enum_values: Vec<Entry>,
+    enum_bit_values: Vec<Entry>,
+    enum_field_type_values: Vec<Key>,
+}
+
+#[derive(Deserialize)]
+#[serde(rename_all = "PascalCase")]
+struct Entry {
+    name: String,
+    value: Option<u64>,
+    value1: Option<u64>,
+    value2: Option<u64>,
+    bit: Option<u64>,
+}
+
+impl Database {
+    /// The database, read when it is first asked for. Nothing is in it if the file that this crate was built with cannot be read, which a
+    /// test excludes.
+    pub fn get() -> &'static Self {
+        static DATABASE: OnceLock<Database> = OnceLock::new();
+        DATABASE.get_or_init(|| Self::read().unwrap_or_default())
+    }
+
+    fn read() -> Option<Self> {
+        let mut text = Vec::new();
+        flate2::read::GzDecoder::new(COMPRESSED).read_to_end(&mut text).ok()?;
+        let file: File = serde_json::from_slice(&text).ok()?;
+        let mut groups = file.groups;
+        groups.sort_by_key(|group| group.pgn);
+        let simple = |entries: Vec<Entry>| {
+            let numbered = |entry: Entry| Some((entry.value.or(entry.bit)?, entry.name));
+            entries.into_iter().filter_map(numbered).collect::<FxHashMap<_, _>>()
+        };
+        let paired = |entry: Entry| Some(((entry.value1?, entry.value2?), entry.name));
+        Some(Self {
+            #[cfg(test)]
+            entries: groups.len(),
+            groups,
+            lookups: file
+                .lookup_enumerations
+                .into_iter()
+                .map(|table| (table.name, simple(table.enum_values)))
+                .collect(),
+            bits: file
+                .lookup_bit_enumerations
+                .into_iter()
+                .map(|table| (table.name, simple(table.enum_bit_values)))
+                .collect(),
+            indirect: file
+                .lookup_indirect_enumerations
+                .into_iter()
+                .map(|table| (table.name, table.enum_values.into_iter().filter_map(paired).collect()))
+                .collect(),
+            kinds: file
+                .lookup_field_type_enumerations
+                .into_iter()
+                .map(|table| {
+                    let keys = table.enum_field_type_values.into_iter();
+                    (table.name, keys.map(|key| (key.value, key)).collect())
+                })
+                .collect(),
+        })
+    }
+
+    /// Those that share a number.
+    pub fn groups(&self, pgn: u32) -> &[Group] {
+        let first = self.groups.partition_point(|group| group.pgn < pgn);
+        let count = self.groups[first..].partition_point(|group| group.pgn == pgn);
+        &self.groups[first..first + count]
+    }
+
+    /// The one that stands for a range of numbers whose meaning is not known.
+    pub fn fallback(&self, pgn: u32) -> Option<&Group> {
+        let before = self.groups.partition_point(|group| group.pgn <= pgn);
+        self.groups[..before].iter().rev().find(|group| group.fallback)
+    }
+
+    #[cfg(test)]
+    pub fn all(&self) -> &[Group] {
+        &self.groups
+    }
+}

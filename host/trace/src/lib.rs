@@ -13,6 +13,7 @@ pub mod filter;
 mod frame;
 mod interface;
 mod length;
+pub mod names;
 pub mod playback;
 mod record;
 pub mod socketcan;

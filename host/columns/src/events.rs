@@ -12,7 +12,8 @@ use cantap_wire::record::TransmitFailure;
 
 use crate::texts::Texts;
 
-const UTC: &str = "UTC";
+/// The zone of all times.
+pub const UTC: &str = "UTC";
 
 /// What a row is if it is none of the table's own.
 pub const LOST: &str = "lost";

@@ -6,7 +6,7 @@ use arrow_array::builder::{ArrayBuilder as _, BinaryBuilder, BooleanBuilder, UIn
 use arrow_array::types::Int8Type;
 use arrow_array::{ArrayRef, RecordBatch};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceRecord};
 
 use crate::events::{self, Events};
 use crate::texts::Texts;
@@ -82,7 +82,7 @@ impl FrameColumns {
         if let TraceEvent::Frame { frame, direction, late } = &record.event {
             let (id, fd) = (frame.id(), frame.fd());
             flags = [id.is_extended(), frame.is_remote(), frame.is_fd(), *late, false, false].map(Some);
-            (flags[4], flags[5]) = (fd.map(|fd| fd.brs()), fd.map(|fd| fd.esi()));
+            (flags[4], flags[5]) = (fd.map(FdFrame::brs), fd.map(FdFrame::esi));
             self.id.append_value(id.raw());
             self.direction.push(i8::from(*direction == Direction::Tx));
             self.dlc.append_value(frame.dlc());

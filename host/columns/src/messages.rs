@@ -58,7 +58,7 @@ impl MessageColumns {
         }
         Self {
             schema: Arc::new(Schema::new_with_metadata(fields, about)),
-            time: TimestampNanosecondBuilder::new().with_timezone("UTC"),
+            time: TimestampNanosecondBuilder::new().with_timezone(events::UTC),
             channel: UInt8Builder::new(),
             id: UInt32Builder::new(),
             signals,

@@ -35,9 +35,12 @@ pub struct SignalColumns {
     raw: UInt64Builder,
     text: Texts<Int32Type>,
     unit: Texts<Int32Type>,
-    keys: HashMap<MessageRef, MessageKeys>,
+    keys: Arc<HashMap<MessageRef, MessageKeys>>,
     indicators: [i32; 2],
 }
+
+/// What rows with a value are called in the column `event`.
+const VALUE: &str = "value";
 
 /// Where a message's texts are in the columns.
 struct MessageKeys {
@@ -84,7 +87,7 @@ impl SignalColumns {
             let signals = signals.collect();
             (reference, MessageKeys { message: messages.place(&message.name), signals })
         });
-        let keys = keys.collect();
+        let keys = Arc::new(keys.collect());
         let mut fields = events::fields();
         let text = Texts::<Int32Type>::data_type();
         fields.extend([
@@ -99,7 +102,7 @@ impl SignalColumns {
         ]);
         Self {
             schema: Arc::new(Schema::new(fields)),
-            events: Events::new("value"),
+            events: Events::new(VALUE),
             id: UInt32Builder::new(),
             extended: BooleanBuilder::new(),
             message: Texts::new(messages.texts),
@@ -110,6 +113,25 @@ impl SignalColumns {
             unit: Texts::new(units.texts),
             keys,
             indicators,
+        }
+    }
+
+    /// An empty table of the same decoder.
+    #[must_use]
+    pub fn another(&self) -> Self {
+        Self {
+            schema: Arc::clone(&self.schema),
+            events: Events::new(VALUE),
+            id: UInt32Builder::new(),
+            extended: BooleanBuilder::new(),
+            message: self.message.another(),
+            signal: self.signal.another(),
+            value: Float64Builder::new(),
+            raw: UInt64Builder::new(),
+            text: self.text.another(),
+            unit: self.unit.another(),
+            keys: Arc::clone(&self.keys),
+            indicators: self.indicators,
         }
     }
 

@@ -19,6 +19,11 @@ impl<K: ArrowDictionaryKeyType> Texts<K> {
         Self { texts: Arc::new(StringArray::from_iter_values(texts)), keys: PrimitiveBuilder::new() }
     }
 
+    /// An empty column of the same texts.
+    pub fn another(&self) -> Self {
+        Self { texts: Arc::clone(&self.texts), keys: PrimitiveBuilder::new() }
+    }
+
     /// The type of such a column.
     pub fn data_type() -> DataType {
         DataType::Dictionary(Box::new(K::DATA_TYPE), Box::new(DataType::Utf8))

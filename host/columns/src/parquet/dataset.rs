@@ -1,7 +1,7 @@
 //! Many files, in folders named by what their rows have in common: `vehicle=7/day=2026-03-01/channel=1/drive.parquet`. Engines
 //! read such a folder as one table, and leave out the files that a question is not about.
 
-use std::fmt;
+use std::fmt::{self, Write as _};
 use std::fs;
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -160,7 +160,7 @@ fn escaped(value: &str) -> String {
         if character.is_control() || "\"#%'*/:=?\\{}[]^ ".contains(character) {
             let mut bytes = [0; 4];
             for byte in character.encode_utf8(&mut bytes).bytes() {
-                text.push_str(&format!("%{byte:02X}"));
+                let _ = write!(text, "%{byte:02X}");
             }
         } else {
             text.push(character);

@@ -10,7 +10,7 @@ pub use parquet::errors::ParquetError;
 use arrow_array::RecordBatch;
 use arrow_schema::SchemaRef;
 
-use crate::{FrameColumns, MessageColumns, SignalColumns};
+use crate::{FrameColumns, MessageColumns, SignalColumns, WideColumns};
 
 /// Rows that become batches.
 pub trait Table {
@@ -54,4 +54,4 @@ impl Table for FrameColumns {
     }
 }
 
-table!(SignalColumns, MessageColumns);
+table!(SignalColumns, MessageColumns, WideColumns);

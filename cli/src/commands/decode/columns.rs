@@ -101,7 +101,7 @@ impl PerMessage {
 /// A table of signals side by side.
 pub struct WideFile {
     path: PathBuf,
-    file: Option<ParquetFile<WideColumns>>,
+    file: Option<Box<ParquetFile<WideColumns>>>,
 }
 
 impl WideFile {
@@ -110,14 +110,14 @@ impl WideFile {
     }
 
     pub fn finish(self) -> Result<(), ParquetError> {
-        self.file.map_or(Ok(()), ParquetFile::finish)
+        self.file.map_or(Ok(()), |file| file.finish())
     }
 }
 
 impl Rows for WideFile {
     fn begin(&mut self, names_and_units: &[(String, String)]) -> anyhow::Result<()> {
         let names = names_and_units.iter().map(|(name, unit)| (name.as_str(), unit.as_str()));
-        self.file = Some(ParquetFile::create(&self.path, WideColumns::new(names))?);
+        self.file = Some(Box::new(ParquetFile::create(&self.path, WideColumns::new(names))?));
         Ok(())
     }
 

@@ -28,6 +28,8 @@ mod boards;
 mod channel_args;
 mod channel_bitrate;
 mod clock;
+#[cfg(feature = "parquet")]
+mod columns;
 mod commands;
 mod completion;
 mod databases;

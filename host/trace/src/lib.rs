@@ -14,6 +14,7 @@ mod frame;
 mod interface;
 mod length;
 pub mod levels;
+pub mod names;
 pub mod playback;
 mod record;
 pub mod socketcan;

@@ -89,7 +89,11 @@ fn boat(at: u32) -> String {
         "0DF80502#4549008000AC0D00",
         "0DF80502#460000FFFFFFFFFF",
     ];
-    if at % 2 == 0 { TALK[(at / 2 % 7) as usize].to_owned() } else { "09F80102#36729A16021AB80D".to_owned() }
+    if at.is_multiple_of(2) {
+        TALK[(at / 2 % 7) as usize].to_owned()
+    } else {
+        "09F80102#36729A16021AB80D".to_owned()
+    }
 }
 
 /// PDOs, heartbeats, and an SDO transfer now and then.

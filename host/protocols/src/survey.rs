@@ -57,7 +57,7 @@ impl Survey {
         for event in self.events.drain(..) {
             let convinces = match event.protocol {
                 Protocol::IsoTp => event.kind == "transfer" && event.frames > 2,
-                _ => event.kind != "no_response",
+                _ => matches!(event.kind, "exchange" | "refusal"),
             };
             if convinces {
                 *self.seen.entry((event.channel, event.protocol)).or_default() += 1;

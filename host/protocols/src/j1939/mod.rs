@@ -87,7 +87,7 @@ impl J1939 {
                 if self.transport.data(channel, time_ns, header, data, &mut out) {
                     Ok(())
                 } else {
-                    // Told once for each message: its first frame, or the one behind a gap, is enough.
+                    // Told once for each message: the rest of it says no more.
                     let mut event = self.event(record, header, "broken");
                     event.trouble = Some(Trouble::Headless);
                     events.push(event);

@@ -37,7 +37,8 @@ fn missing_frames_are_said() {
     assert!(broken[0].ends_with("received 0 bytes; frame 2 came instead of 1"), "{broken:?}");
     let late = said(&[DM1[0], DM1[1], (2000.0, "18FEF100#0000000000000000")]);
     assert!(late[0].ends_with("received 7 bytes; nothing came for 750 ms"), "{late:?}");
-    let headless = said(&DM1[1..2]);
+    let headless = said(&DM1[1..]);
+    assert_eq!(headless.len(), 1, "{headless:?}");
     assert!(headless[0].ends_with("its beginning was not heard"), "{headless:?}");
     let unfinished = said(&DM1[..2]);
     assert!(unfinished[0].ends_with("the trace ends here"), "{unfinished:?}");

@@ -81,6 +81,8 @@ pub(super) struct Open {
 #[derive(Clone, Debug, Default)]
 pub struct LongMessages {
     open: FxHashMap<(u8, u8, u8, bool), Open>,
+    /// Messages that ended early, or whose beginning was not heard: the last frame of each, so that its rest is told once.
+    headless: FxHashMap<(u8, u8, u8, bool), u8>,
     sweep_ns: i64,
 }
 
@@ -139,6 +141,7 @@ impl LongMessages {
     }
 
     fn begin(&mut self, key: (u8, u8, u8, bool), open: Open, out: &mut impl FnMut(Assembled)) {
+        self.headless.remove(&key);
         if let Some(before) = self.open.remove(&key) {
             end(before, Trouble::Overlapped, out);
         }
@@ -247,7 +250,7 @@ impl LongMessages {
         Ok(())
     }
 
-    /// Takes a data frame; false if it belongs to nothing that is under way.
+    /// Takes a data frame; false if it is the first of those that belong to nothing under way.
     pub fn data(
         &mut self,
         channel: u8,
@@ -257,8 +260,14 @@ impl LongMessages {
         out: &mut impl FnMut(Assembled),
     ) -> bool {
         let key = (channel, header.source, header.destination, header.pgn == EXTENDED_DATA);
-        let Some(open) = self.open.get_mut(&key) else { return false };
         let Some((&sequence, bytes)) = data.split_first() else { return true };
+        let Some(open) = self.open.get_mut(&key) else {
+            if self.headless.len() >= MOST_OPEN {
+                self.headless.clear();
+            }
+            let before = self.headless.insert(key, sequence);
+            return before.is_some_and(|before| before.wrapping_add(1) == sequence);
+        };
         let message = &mut open.message;
         (message.time_ns, message.frames) = (time_ns, message.frames + 1);
         let number = open.offset + u32::from(sequence);
@@ -266,6 +275,7 @@ impl LongMessages {
             let trouble = Trouble::Sequence { expected: open.next, got: number };
             if message.way == Way::Broadcast {
                 if let Some(open) = self.open.remove(&key) {
+                    self.headless.insert(key, sequence);
                     end(open, trouble, out);
                 }
             } else {

@@ -129,12 +129,11 @@ impl<'q, const N: usize> Capture<'q, N> {
         clock: &C,
         entered: Option<u32>,
     ) {
-        let ended = match entered {
-            Some(entered) => self.collect(channel, &mut traffic[channel.index()], clock, entered),
-            None => {
-                traffic[channel.index()].await_finished();
-                self.recorder.time(clock.now())
-            }
+        let ended = if let Some(entered) = entered {
+            self.collect(channel, &mut traffic[channel.index()], clock, entered)
+        } else {
+            traffic[channel.index()].await_finished();
+            self.recorder.time(clock.now())
         };
         let patience = ended + Self::patience_ticks::<C>();
         // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time

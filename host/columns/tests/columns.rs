@@ -1,6 +1,5 @@
 //! Columns hold everything that a record says, and decoded values as the decoder gives them.
 
-use arrow_array::Array;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
 use cantap_columns::{FrameColumns, MessageColumns, SignalColumns, records};
@@ -13,7 +12,9 @@ proptest! {
     #[test]
     fn every_record_comes_back_from_its_columns(wanted in prop::collection::vec(record_or_fd(1), 0..50)) {
         let mut columns = FrameColumns::default();
-        wanted.iter().for_each(|record| columns.push(record));
+        for record in &wanted {
+            columns.push(record);
+        }
         prop_assert_eq!(columns.rows(), wanted.len());
         prop_assert_eq!(records(&columns.take()).unwrap(), wanted);
         prop_assert_eq!(columns.rows(), 0);

@@ -265,7 +265,11 @@ impl Client {
                     None => self.shared.ask(command, Then::Nothing),
                 }
             }
-            Command::Configure { .. } | Command::ClearDefaults => {
+            // A measurement has one to whom its edges go: who holds the right. It ends when a channel opens.
+            Command::Configure { .. }
+            | Command::ClearDefaults
+            | Command::MeasureEdges { .. }
+            | Command::Edges => {
                 self.shared.state().hold(self.id)?;
                 self.shared.ask(command, Then::Nothing)
             }

@@ -265,7 +265,7 @@ pub(super) mod tests {
             dominant,
             unsure: false,
         });
-        pin.edges.splice(place + 1..place + 1, glitch);
+        pin.edges.splice((place + 1)..=place, glitch);
         let measured = measure(&pin.edges, LEAST, MOST).unwrap();
         assert_eq!((measured.frames, measured.acknowledged), (2, 2));
         assert!((TICK_HZ / measured.bit_ticks / 500e3 - 1.0).abs() < 0.001);

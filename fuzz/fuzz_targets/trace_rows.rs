@@ -6,7 +6,7 @@ mod trace;
 
 use cantap_formats::{CsvDialect, Format};
 
-const FORMATS: [Format; 8] = [
+const FORMATS: [Format; 9] = [
     Format::Csv(CsvDialect::Gvret),
     Format::CandumpScreen,
     Format::Busmaster,
@@ -15,6 +15,7 @@ const FORMATS: [Format; 8] = [
     Format::Microchip,
     Format::CanHacker,
     Format::Printer,
+    Format::CanKing,
 ];
 
 libfuzzer_sys::fuzz_target!(|bytes: &[u8]| {

@@ -42,7 +42,7 @@ pub const WASM: &[Check] = &[Check {
     needs: None,
 }];
 
-/// On Windows the whole command but zstd, which is C. For macOS, signals are missing, too: their parser's stack guard is assembly.
+/// On Windows the whole command but zstd and SQLite, which are C. For macOS, signals are missing, too: their parser's stack guard is assembly.
 pub const SYSTEMS: &[Check] = &[
     Check {
         target: "x86_64-pc-windows-gnu",

@@ -26,9 +26,9 @@ use crate::trace_output::{TraceOutput, failed};
     Names end in .log, .asc, .blf, .trc, .csv, .pcapng, .mf4 or .dif; .gz, .zst, .xz and .lz4 behind that compress. \
     Files of any other program are known by their beginning.\n\n\
     Dates in ASC, TRC, BLF and some logs are the clock of the computer that wrote them: name its zone with --zone.\n\n\
-    Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, pcapng, \
-    mf4, dif. Only read: pcap, csv-gvret (SavvyCAN), candump-screen, busmaster, crtd, kvaser, microchip, canhacker, \
-    printer (python-can).\n\n\
+    Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, \
+    csv-gvret (SavvyCAN's), pcapng, mf4, dif. Only read: pcap, candump-screen, busmaster, crtd, kvaser, canking, microchip, \
+    canhacker, printer and sqlite (python-can's).\n\n\
     What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read (an older \
     OUT then stays as it is), or with --strict something in IN was wrong.")]
 pub struct Args {

@@ -167,6 +167,21 @@ mod tests {
     }
 
     #[test]
+    fn fd_frames_without_the_flag_or_in_the_place_of_classical_ones_are_read() {
+        let (log, issues) = as_log(
+            "1.0 CANFD 1 Rx 123 1 0 2 2 11 22 0 0 0\n1.0 CANFD 1 Rx 123 0 1 2 2 11 22 0 0 0\n1.0 CANFD 1 Rx 123 0 0 2 2 11 22 0 0 0\n\
+             1.0 1 123 Rx d 0C 00 01 02 03 04 05 06 07 08 09 0A 0B\n1.0 1 123 Rx d 0D 00 01 02 03 04 05 06 07 08 09 0A 0B 0C\n\
+             1.0 1 123 Rx d 0C 00 01 02 03 04 05 06 07 08 09 0A 0B 0C\n1.0 CANFD 1 Rx 123 1 0 0 0 8 00 01 02\n",
+        );
+        assert_eq!(
+            log,
+            "(1506783974.191000) can0 123##11122\n(1506783974.191000) can0 123##21122\n(1506783974.191000) can0 123#1122\n\
+             (1506783974.191000) can0 123##0000102030405060708090A0B\n(1506783974.191000) can0 123##1\n"
+        );
+        assert_eq!(issues.len(), 2, "{issues:?}");
+    }
+
+    #[test]
     fn lines_are_what_other_programs_read() {
         let (records, _) = tests::read(
             Format::Candump,

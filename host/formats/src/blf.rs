@@ -8,6 +8,7 @@
 mod decode;
 mod encode;
 mod kinds;
+mod object;
 
 pub(crate) use decode::Decoder;
 pub(crate) use encode::Encoder;

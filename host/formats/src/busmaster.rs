@@ -69,7 +69,7 @@ impl RowFormat for Decoder {
         let len = super::frame_fields::length_code(len)?;
         let fields = FrameFields { id, remote, direction, len, fd: None };
         let byte = if self.decimal { decimal_byte } else { hex_byte };
-        let data = Payload::words(words, fields.data_len(), byte)?;
+        let data = Payload::exactly(words, fields.data_len(), byte)?;
         Ok(Line::Record(TraceRecord { time_ns, channel, event: fields.event(&data)? }))
     }
 
@@ -204,11 +204,11 @@ mod tests {
         let (log, issues) = as_log(&format!(
             "{}23:59:59 Rx 1 0x023 s 0\n23:59:59:1 Px 1 0x023 s 0\n23:59:59:1 Rx 300 0x023 s 0\n23:59:59:1 Rx 1 0xG s 0\n\
              23:59:59:1 Rx 1 0x023 q 0\n23:59:59:1 Rx 1 0x800 s 0\n23:59:59:1 Rx 1 0x023 s 16\n23:59:59:1 Rx 1 0x023 s 2 11\n\
-             23:59:59:1 Rx 1 0x023 s 1 1",
+             23:59:59:1 Rx 1 0x023 s 1 11 22\n23:59:59:1 Rx 1 0x023 s 1 1",
             head("***HEX***\n***SYSTEM MODE***\n")
         ));
-        assert_eq!((log.as_str(), issues.len()), ("", 9), "{issues:#?}");
+        assert_eq!((log.as_str(), issues.len()), ("", 10), "{issues:#?}");
         assert!(issues[0].contains("line 12: expected a line such as"), "{issues:#?}");
-        assert!(issues[8].contains("line 20: the file ends inside a line"), "{issues:#?}");
+        assert!(issues[9].contains("line 21: the file ends inside a line"), "{issues:#?}");
     }
 }

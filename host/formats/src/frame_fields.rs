@@ -62,6 +62,21 @@ impl Payload {
         Ok(payload)
     }
 
+    /// As [`Self::words`], and behind them stands no further byte: else the length would be wrong.
+    pub(crate) fn exactly<'a>(
+        mut words: impl Iterator<Item = &'a [u8]>,
+        len: usize,
+        parse: impl Fn(&[u8]) -> Option<u8>,
+    ) -> Result<Self, Fault> {
+        let payload = Self::words(&mut words, len, &parse)?;
+        match words.next() {
+            Some(word) if parse(word).is_some() => {
+                Err(Fault::malformed(format!("{len} data bytes"), b"more"))
+            }
+            _ => Ok(payload),
+        }
+    }
+
     pub(crate) fn as_slice(&self) -> &[u8] {
         &self.bytes[..self.len]
     }

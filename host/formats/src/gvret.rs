@@ -1,11 +1,13 @@
 //! SavvyCAN's own CSV, which GVRET boards and their tools write too: `Time Stamp,ID,Extended,Dir,Bus,LEN,D1,…,D8`, times in
 //! microseconds, buses from 0. Older files have no direction.
 
+use super::codec::Encode;
 use super::found::Row;
 use super::frame_fields::{FdFields, FrameFields, Payload, direction, hex_byte, identifier};
 use super::issue::Fault;
+use super::left_out::LeftOut;
 use super::text;
-use cantap_trace::{Direction, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// Reads the rows.
 #[derive(Default)]
@@ -20,6 +22,9 @@ pub(crate) fn is_head(line: &[u8]) -> bool {
     line.get(..HEAD.len()).is_some_and(|start| start.eq_ignore_ascii_case(HEAD))
 }
 
+/// Nanoseconds of the unit that times are in.
+const NS_PER_US: i64 = 1000;
+
 impl RowDecoder {
     /// Looks at a line that may be the head; true if it is.
     pub(crate) fn head(&mut self, line: &[u8]) -> bool {
@@ -30,7 +35,6 @@ impl RowDecoder {
 
     /// A row.
     pub(crate) fn line(&self, line: &[u8]) -> Result<Row, Fault> {
-        const NS_PER_US: i64 = 1000;
         let mut cells = line.split(|byte| *byte == b',').map(<[u8]>::trim_ascii);
         let mut next = || cells.next().unwrap_or_default();
         let (time, id, extended) = (next(), next(), next());
@@ -40,7 +44,7 @@ impl RowDecoder {
         let raw =
             text::hex(digits).ok_or_else(|| Fault::malformed("an identifier in hexadecimal digits", id))?;
         let extended = match extended {
-            // Files are about that leave the mark out, where the identifier alone says it.
+            // Some files leave the mark out where the identifier alone says it.
             b"false" | b"False" | b"FALSE" | b"0" => raw > 0x7FF,
             b"true" | b"True" | b"TRUE" | b"1" => true,
             other => return Err(Fault::malformed("'true' or 'false' under Extended", other)),
@@ -54,15 +58,80 @@ impl RowDecoder {
         let len = number.ok_or_else(|| Fault::malformed("a length of 0 to 64", len))? as u8;
         let fd = (len > 8).then(FdFields::default);
         let fields = FrameFields { id: identifier(raw, extended, id)?, remote: false, direction, len, fd };
-        let data = Payload::words(cells, fields.data_len(), hex_byte)?;
+        // Some programs write 0x in front of bytes.
+        let byte = |cell: &[u8]| hex_byte(cell.strip_prefix(b"0x").unwrap_or(cell));
+        let data = Payload::words(cells, fields.data_len(), byte)?;
         Ok(Some((TraceRecord { time_ns, channel, event: fields.event(&data)? }, None)))
+    }
+}
+
+/// Writes the rows.
+#[derive(Default)]
+pub(crate) struct Encoder {
+    started: bool,
+}
+
+impl Encoder {
+    fn start(&mut self, out: &mut Vec<u8>) {
+        if !std::mem::replace(&mut self.started, true) {
+            out.extend_from_slice(b"Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n");
+        }
+    }
+}
+
+impl Encode for Encoder {
+    fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
+        self.start(out);
+        let (frame, direction) = match &record.event {
+            TraceEvent::Frame { frame, .. } if frame.is_remote() => {
+                return left_out.note("remote frames, which SavvyCAN's CSV has no form for");
+            }
+            TraceEvent::Frame { frame, direction, .. } => (frame, direction),
+            _ => return left_out.note("errors, states and losses, which SavvyCAN's CSV has no form for"),
+        };
+        let Some(bus) = record.channel.checked_sub(1) else {
+            return left_out.note("frames of channel 0, which SavvyCAN's CSV has no number for");
+        };
+        match frame {
+            TraceFrame::Fd(frame) => {
+                if frame.data_len() <= 8 {
+                    left_out
+                        .note("that short CAN FD frames are such, which SavvyCAN's CSV has no column for");
+                }
+                if frame.flags() != 0 {
+                    left_out.note("the flags of CAN FD frames, which SavvyCAN's CSV has no column for");
+                }
+            }
+            TraceFrame::Classic(frame) if frame.dlc() > 8 => {
+                left_out.note("length codes above 8, which SavvyCAN's CSV has no form for");
+            }
+            TraceFrame::Classic(_) => {}
+        }
+        text::push_time(out, record.time_ns, NS_PER_US, 0, b'.');
+        out.push(b',');
+        text::push_hex(out, frame.id().raw(), 8);
+        out.extend_from_slice(if frame.id().is_extended() { b",true," } else { b",false," });
+        out.extend_from_slice(if *direction == Direction::Tx { b"Tx," } else { b"Rx," });
+        text::push_decimal(out, u64::from(bus));
+        out.push(b',');
+        text::push_decimal(out, frame.data_len() as u64);
+        out.push(b',');
+        for byte in frame.data() {
+            text::push_hex_byte(out, *byte);
+            out.push(b',');
+        }
+        out.push(b'\n');
+    }
+
+    fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        self.start(out);
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::super::tests;
-    use crate::{CsvDialect, Format};
+    use crate::{CsvDialect, Format, WriteOptions};
 
     const CSV: Format = Format::Csv(CsvDialect::Gvret);
 
@@ -84,6 +153,56 @@ mod tests {
         let (records, issues) = tests::read(CSV, old);
         assert_eq!(issues, Vec::<String>::new());
         assert_eq!(tests::write(Format::Candump, &records), "(166.064000) can0 21A#FE3612\n");
+    }
+
+    #[test]
+    fn rows_are_savvycans_and_what_they_have_no_form_for_is_counted() {
+        let log = "(1410714882.622188) can0 123#1122\n(1410714882.622189) can1 18DAF110#0102030405060708 T\n\
+                   (1410714882.622190) can0 124##1000102030405060708090A0B\n(1410714882.622191) can0 124##011\n\
+                   (1410714882.622192) can0 125#0102030405060708_C\n(1410714882.622193) can0 123#R4\n\
+                   (1410714882.622194) channel0 123#11\n(1410714882.622195) can0 20000088#0000040000000000\n\
+                   (-1.500000) can0 123#\n";
+        let (records, issues) = tests::read(Format::Candump, log);
+        assert_eq!((records.len(), issues), (9, vec![]));
+        let options = WriteOptions { format: Some(CSV), ..WriteOptions::default() };
+        let (bytes, left_out) = tests::write_with(&options, &records);
+        assert_eq!(
+            String::from_utf8(bytes.clone()).unwrap(),
+            "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n\
+             1410714882622188,00000123,false,Rx,0,2,11,22,\n\
+             1410714882622189,18DAF110,true,Tx,1,8,01,02,03,04,05,06,07,08,\n\
+             1410714882622190,00000124,false,Rx,0,12,00,01,02,03,04,05,06,07,08,09,0A,0B,\n\
+             1410714882622191,00000124,false,Rx,0,1,11,\n\
+             1410714882622192,00000125,false,Rx,0,8,01,02,03,04,05,06,07,08,\n\
+             -1500000,00000123,false,Rx,0,0,\n"
+        );
+        let counts: Vec<_> =
+            left_out.iter().map(|(what, count)| (what.split(',').next().unwrap(), count)).collect();
+        let expected = [
+            ("errors", 1),
+            ("frames of channel 0", 1),
+            ("length codes above 8", 1),
+            ("remote frames", 1),
+            ("that short CAN FD frames are such", 1),
+            ("the flags of CAN FD frames", 1),
+        ];
+        assert_eq!(counts, expected);
+        let (read, issues) = tests::read(CSV, bytes);
+        assert_eq!(issues, Vec::<String>::new());
+        assert_eq!(
+            tests::write(Format::Candump, &read),
+            "(1410714882.622188) can0 123#1122\n(1410714882.622189) can1 18DAF110#0102030405060708 T\n\
+             (1410714882.622190) can0 124##0000102030405060708090A0B\n(1410714882.622191) can0 124#11\n\
+             (1410714882.622192) can0 125#0102030405060708\n(-1.500000) can0 123#\n"
+        );
+    }
+
+    #[test]
+    fn bytes_with_0x_in_front_are_read() {
+        let file = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2\n1,0x123,false,Rx,0,2,0x11,0xFF\n2,0x123,false,Rx,0,1,0x1,\n";
+        let (records, issues) = tests::read(CSV, file);
+        assert_eq!(tests::write(Format::Candump, &records), "(0.000001) can0 123#11FF\n");
+        assert_eq!(issues, ["test, line 3: expected 1 data bytes, found '0x1'"]);
     }
 
     #[test]

@@ -64,7 +64,7 @@ pub(crate) struct Line<'a> {
 }
 
 impl Line<'_> {
-    /// What is wrong with this line. The last line of a file that was cut off is no broken one.
+    /// What is wrong with this line. The last line of a file that was cut off is not a broken one.
     pub(crate) fn issue(&self, fault: Fault) -> Found {
         let fault = match fault {
             Fault::Malformed { .. } if !self.terminated && !self.too_long => Fault::Truncated("a line"),

@@ -13,6 +13,8 @@ pub enum Place {
     Line(u64),
     /// Bytes from the start of a binary file, after decompression.
     Offset(u64),
+    /// A row of a database's table, by its number there.
+    Row(i64),
 }
 
 impl fmt::Display for Place {
@@ -20,6 +22,7 @@ impl fmt::Display for Place {
         match self {
             Self::Line(line) => write!(f, "line {line}"),
             Self::Offset(offset) => write!(f, "offset {offset:#x}"),
+            Self::Row(row) => write!(f, "row {row}"),
         }
     }
 }

@@ -14,6 +14,7 @@ mod calendar;
 mod candump;
 mod candump_screen;
 mod canhacker;
+mod canking;
 mod codec;
 mod compressed;
 mod compression;
@@ -47,6 +48,8 @@ mod rotation;
 mod row_format;
 mod sja1000;
 mod socketcan_packet;
+#[cfg(feature = "sqlite")]
+mod sqlite;
 #[cfg(test)]
 mod tests;
 mod text;

@@ -52,7 +52,7 @@ impl RowFormat for Decoder {
         let id = identifier(raw, marked || raw > 0x7FF, id)?;
         let fields = FrameFields { id, remote: false, direction, len: length_code(len)?, fd: None };
         let byte = |word: &[u8]| number(word).and_then(|byte| u8::try_from(byte).ok());
-        let data = Payload::words(cells, fields.data_len(), byte)?;
+        let data = Payload::exactly(cells, fields.data_len(), byte)?;
         Ok(Line::Record(TraceRecord { time_ns, channel: 1, event: fields.event(&data)? }))
     }
 
@@ -85,10 +85,10 @@ mod tests {
     #[test]
     fn broken_rows_are_named() {
         let file = format!(
-            "{HEAD}x;RX;0xC2;0\n1;PX;0xC2;0\n1;RX;0xG;0\n1;RX;0xC2;16\n1;RX;0xC2;2;0x11\n1;RX;0xC2;1;0x111\n1;RX;0xC2;1;0x1"
+            "{HEAD}x;RX;0xC2;0\n1;PX;0xC2;0\n1;RX;0xG;0\n1;RX;0xC2;16\n1;RX;0xC2;2;0x11\n1;RX;0xC2;1;0x11;0x22\n1;RX;0xC2;1;0x111\n1;RX;0xC2;1;0x1"
         );
         let (records, issues) = tests::read(Format::Microchip, file);
-        assert_eq!((records.len(), issues.len()), (0, 7), "{issues:#?}");
-        assert!(issues[6].contains("line 13: the file ends inside a line"), "{issues:#?}");
+        assert_eq!((records.len(), issues.len()), (0, 8), "{issues:#?}");
+        assert!(issues[7].contains("line 14: the file ends inside a line"), "{issues:#?}");
     }
 }

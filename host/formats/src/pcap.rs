@@ -176,7 +176,7 @@ impl Decoder {
             None if len == 0 => return Ok(Some(Found::End)),
             None => Fault::malformed("a pcap file, which begins with a magic number", &head[..len.min(4)]),
         };
-        // What is behind a wrong head says nothing.
+        // Nothing behind a wrong head can be trusted.
         while !input.buffered().is_empty() {
             let rest = input.peek(1)?.len();
             input.consume(rest);

@@ -66,7 +66,7 @@ impl RowFormat for Decoder {
         } else {
             usize::from(len.min(8))
         };
-        let data = Payload::words(&mut words, needed, hex_byte)?;
+        let data = Payload::exactly(&mut words, needed, hex_byte)?;
         let name = memchr::memmem::rfind(line, b"Channel: ").map(|at| line[at + 9..].trim_ascii());
         let channel = self.interfaces.channel(name.unwrap_or(b"can0"));
         let record = |event| TraceRecord { time_ns, channel, event };

@@ -14,8 +14,8 @@ use super::left_out::LeftOut;
 use super::row_format::Rows;
 use super::zone::Zone;
 use super::{
-    Format, UnknownFormat, asc, blf, busmaster, candump, candump_screen, canhacker, crtd, csv, dif, kvaser,
-    mf4, microchip, pcap, pcapng, printer, trc,
+    Format, UnknownFormat, asc, blf, busmaster, candump, candump_screen, canhacker, canking, crtd, csv, dif,
+    kvaser, mf4, microchip, pcap, pcapng, printer, trc,
 };
 use cantap_trace::TraceRecord;
 
@@ -136,6 +136,13 @@ impl TraceReader {
             Format::Microchip => Box::new(Rows::<microchip::Decoder>::default()),
             Format::CanHacker => Box::new(Rows::<canhacker::Decoder>::default()),
             Format::Printer => Box::new(Rows::<printer::Decoder>::default()),
+            Format::CanKing => Box::new(Rows::<canking::Decoder>::default()),
+            #[cfg(feature = "sqlite")]
+            Format::Sqlite => Box::new(super::sqlite::Decoder::default()),
+            #[cfg(not(feature = "sqlite"))]
+            Format::Sqlite => Box::new(super::codec::Missing(
+                "this build reads no SQLite; build it with the feature `sqlite`",
+            )),
         };
         let batch = Vec::with_capacity(BATCH);
         let head = input.buffered().iter().take(content::HEAD_BYTES).copied().collect();

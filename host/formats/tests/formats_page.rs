@@ -39,7 +39,6 @@ fn row(format: Format) -> String {
     if !format.is_written() {
         // What each has a place for, as its own tests show.
         let [times, rest] = match format {
-            Format::Csv(CsvDialect::Gvret) => ["1 µs, date or not", "yes | yes | – | yes | – | – | –"],
             Format::Pcap => ["1 ns", "– | yes | yes | yes | yes | yes | –"],
             Format::CandumpScreen => {
                 ["1 µs, local with `-t A`", "yes | with `-x` | yes | yes | yes | yes | –"]
@@ -50,6 +49,8 @@ fn row(format: Format) -> String {
             Format::Microchip => ["1 ms, no date", "– | yes | – | – | – | – | –"],
             Format::CanHacker => ["1 ms, no date, of a minute", "– | – | – | – | – | – | –"],
             Format::Printer => ["1 µs", "yes | yes | yes | yes | yes | yes | –"],
+            Format::CanKing => ["as written, no date", "yes | yes | yes | yes | that there was one | – | –"],
+            Format::Sqlite => ["as written", "– | – | yes | without flags | yes | yes | yes"],
             new => panic!("{new} has no row here yet"),
         };
         return format!("| {format} | read | {times} | {rest} |");

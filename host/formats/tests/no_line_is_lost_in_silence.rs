@@ -28,20 +28,17 @@ fn records(fd: bool) -> Vec<TraceRecord> {
     records.enumerate().map(flexible).collect()
 }
 
-#[test]
-fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
-    let directory = tempfile::tempdir().unwrap();
-    for (format, fd) in [
-        (Format::Candump, true),
-        (Format::Asc, true),
-        (Format::Trc(TrcVersion::V2_1), true),
-        (Format::Trc(TrcVersion::V2_0), true),
-        (Format::Trc(TrcVersion::V1_3), false),
-        (Format::Trc(TrcVersion::V1_1), false),
-        (Format::Trc(TrcVersion::V1_0), false),
-        (Format::Csv(CsvDialect::PythonCan), false),
-        (Format::Csv(CsvDialect::Full), true),
-    ] {
+/// A text of each format: what stands in front of the rows, and the rows.
+struct Text {
+    format: Format,
+    head: Vec<u8>,
+    rows: Vec<Vec<u8>>,
+}
+
+impl Text {
+    /// As this library writes it.
+    fn written(format: Format, fd: bool) -> Self {
+        let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("whole");
         let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
         let mut writer = create_writer(&path, &options).unwrap();
@@ -51,39 +48,190 @@ fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
         writer.finish().unwrap();
         let mut text = Vec::new();
         std::fs::File::open(&path).unwrap().read_to_end(&mut text).unwrap();
+        let mut lines: Vec<Vec<u8>> =
+            text.split_inclusive(|byte| *byte == b'\n').map(<[u8]>::to_vec).collect();
+        let rows = lines.split_off(lines.iter().position(|line| is_row(format, line)).unwrap());
+        Self { format, head: lines.concat(), rows: rows.into_iter().take(LINES).collect() }
+    }
+
+    /// As another program writes it: `row` is told the record's number, identifier, whether that is extended, and its bytes.
+    fn foreign(format: Format, head: &str, row: impl Fn(usize, u32, bool, &[u8]) -> String) -> Self {
+        let rows = records(false).into_iter().enumerate().map(|(at, record)| {
+            let frame = record.frame().unwrap();
+            row(at, frame.id().raw(), frame.id().is_extended(), frame.data()).into_bytes()
+        });
+        Self { format, head: head.as_bytes().to_vec(), rows: rows.collect() }
+    }
+
+    /// How many records and issues, and how many other things that are counted, are in a file of the head and these rows.
+    fn found(&self, rows: &[&[u8]]) -> (u64, u64, u64) {
+        let source = Cursor::new([&self.head, &rows.concat()[..]].concat());
+        let mut reader =
+            TraceReader::from_source("damaged", source, self.format, &ReadOptions::default()).unwrap();
+        let issues = reader.by_ref().filter(Result::is_err).count() as u64;
+        (reader.records(), issues, reader.left_out().total() + reader.notes().total())
+    }
+}
+
+fn hex(data: &[u8], between: &str) -> String {
+    data.iter().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().join(between)
+}
+
+/// The formats that are only read.
+fn foreign() -> Vec<Text> {
+    let letter = |extended, yes, no| if extended { yes } else { no };
+    vec![
+        Text::foreign(Format::CandumpScreen, "", |at, id, extended, data| {
+            let id = if extended { format!("{id:08X}") } else { format!("{id:03X}") };
+            format!(" (1410714882.{at:06})  can0  {id}   [{}]  {}\n", data.len(), hex(data, " "))
+        }),
+        Text::foreign(
+            Format::Busmaster,
+            "***BUSMASTER Ver 2.4.0***\n***PROTOCOL CAN***\n***START DATE AND TIME 8:8:2014 23:59:58:965***\n***HEX***\n***SYSTEM MODE***\n",
+            |at, id, extended, data| {
+                format!(
+                    "23:59:59:{at:04} Rx 1 0x{id:03X} {} {} {} \n",
+                    letter(extended, "x", "s"),
+                    data.len(),
+                    hex(data, " ")
+                )
+            },
+        ),
+        Text::foreign(Format::Crtd, "", |at, id, extended, data| {
+            format!("1320745424.{at:06} 1R{} {id:X} {}\n", letter(extended, "29", "11"), hex(data, " "))
+        }),
+        Text::foreign(
+            Format::Kvaser,
+            "Kvaser Memorator Log\nFormat of data field: HEX\nFormat of id field:   HEX\nTime Chan   Identifier\n=======\n",
+            |at, id, extended, data| {
+                format!(
+                    "    0.{at:06}  1  {id:8X}{}   Rx  {}  {}   {at}\n",
+                    letter(extended, "x", " "),
+                    data.len(),
+                    hex(data, " ")
+                )
+            },
+        ),
+        Text::foreign(
+            Format::CanKing,
+            "Chn Identifier Flg   DLC  D0...1...2...3...4...5...6..D7       Time     Dir\n",
+            |at, id, extended, data| {
+                format!(
+                    " 0    {id:08X} {}       {}  {}     1.{at:06} R\n",
+                    letter(extended, "X", " "),
+                    data.len(),
+                    hex(data, "  ")
+                )
+            },
+        ),
+        Text::foreign(
+            Format::Microchip,
+            "//-----\nMicrochip Technology Inc.\nCAN BUS Analyzer\n//-----\n",
+            |at, id, _, data| format!("{at};RX;0x{id:X};{};0x{}\n", data.len(), hex(data, ";0x")),
+        ),
+        Text::foreign(
+            Format::CanHacker,
+            "Time   ID     DLC Data                    Comment\n",
+            |_, id, _, data| format!("00.500 {id:X} {} {} \n", data.len(), hex(data, " ")),
+        ),
+        Text::foreign(Format::Printer, "", |at, id, extended, data| {
+            format!(
+                "Timestamp: 1410714882.{at:06}    ID: {id:8x}    {} Rx                DL:  {}    {}     Channel: can0\n",
+                letter(extended, "X", "S"),
+                data.len(),
+                hex(data, " ").to_lowercase()
+            )
+        }),
+    ]
+}
+
+#[test]
+fn with_one_byte_changed_in_every_line_none_is_lost_without_being_counted() {
+    let written = [
+        (Format::Candump, true),
+        (Format::Asc, true),
+        (Format::Trc(TrcVersion::V2_1), true),
+        (Format::Trc(TrcVersion::V2_0), true),
+        (Format::Trc(TrcVersion::V1_3), false),
+        (Format::Trc(TrcVersion::V1_2), false),
+        (Format::Trc(TrcVersion::V1_1), false),
+        (Format::Trc(TrcVersion::V1_0), false),
+        (Format::Csv(CsvDialect::PythonCan), false),
+        (Format::Csv(CsvDialect::Full), true),
+        (Format::Csv(CsvDialect::Analyser), false),
+        (Format::Csv(CsvDialect::Gvret), true),
+    ];
+    let written = written.into_iter().map(|(format, fd)| Text::written(format, fd));
+    for text in written.chain(foreign()) {
+        let (format, whole) = (text.format, &text.rows);
+        let all: Vec<&[u8]> = whole.iter().map(Vec::as_slice).collect();
+        // Nobody writes a comment or a warning without being asked.
+        assert_eq!(text.found(&all), (LINES as u64, 0, 0), "{format}: the rows are none");
         for seed in 0..2 {
             let mut random = fastrand::Rng::with_seed(seed);
-            let whole: Vec<Vec<u8>> =
-                text.split_inclusive(|byte| *byte == b'\n').map(<[u8]>::to_vec).collect();
-            let mut lines = whole.clone();
-            // Heads and what stands behind the last row stay whole.
-            let head = lines.iter().position(|line| is_row(format, line)).unwrap();
-            for line in &mut lines[head..head + LINES] {
-                let at =
-                    random.usize(..line.len() - line.iter().rev().take_while(|byte| **byte < b' ').count());
-                let old = line[at];
-                while line[at] == old || matches!(line[at], b'\n' | b'\r') {
-                    line[at] = random.u8(..);
-                }
-            }
-            // Each with the head and a whole row alone: a line that says two things would make up for one that is lost.
-            let before = whole[..=head].concat();
             let mut issues = 0;
-            for line in &lines[head..head + LINES] {
-                let source = Cursor::new([&before[..], line].concat());
-                let mut reader =
-                    TraceReader::from_source("damaged", source, format, &ReadOptions::default()).unwrap();
-                let found: Vec<_> = reader.by_ref().collect();
-                let counted = found.len() as u64 + reader.left_out().total() + reader.notes().total();
+            for row in whole {
+                let mut row = row.clone();
+                let at =
+                    random.usize(..row.len() - row.iter().rev().take_while(|byte| **byte < b' ').count());
+                let old = row[at];
+                while row[at] == old || matches!(row[at], b'\n' | b'\r') {
+                    row[at] = random.u8(..);
+                }
+                // With a whole row in front, alone: a line that says two things would make up for one that is lost.
+                let (records, wrong, others) = text.found(&[&whole[0], &row]);
                 // A comment is one of its own kind, which the program that made it may have written.
-                let is_comment = matches!(format, Format::Candump) && line.starts_with(b"#");
-                assert!(counted > 1 || is_comment, "{format:?}: {:?}", String::from_utf8_lossy(line));
-                issues += usize::from(found.iter().any(Result::is_err));
+                let is_comment = match format {
+                    Format::Candump => row.starts_with(b"#"),
+                    Format::Csv(CsvDialect::Analyser) => matches!(row[0], b'#' | b'/'),
+                    _ => false,
+                };
+                assert!(
+                    records + wrong + others > 1 || is_comment,
+                    "{format}: {:?}",
+                    String::from_utf8_lossy(&row)
+                );
+                issues += u64::from(wrong > 0);
             }
             // A test that damages nothing would show nothing.
-            assert!(issues > LINES / 20, "{format:?}: {issues}");
+            assert!(issues > LINES as u64 / 20, "{format}: {issues}");
         }
     }
+}
+
+/// In DIF a row is many lines.
+#[test]
+fn with_one_byte_changed_in_every_row_of_a_table_each_is_a_record_or_an_issue() {
+    const BEGIN: &[u8] = b"-1,0\r\nBOT\r\n";
+    let directory = tempfile::tempdir().unwrap();
+    let path = directory.path().join("whole.dif");
+    let mut writer = create_writer(&path, &WriteOptions::default()).unwrap();
+    for record in records(false) {
+        writer.write(&record).unwrap();
+    }
+    writer.finish().unwrap();
+    let text = std::fs::read(&path).unwrap();
+    let begins: Vec<_> = (0..text.len()).filter(|at| text[*at..].starts_with(BEGIN)).collect();
+    // The names of the columns, then the rows.
+    assert_eq!(begins.len(), LINES + 1);
+    let mut random = fastrand::Rng::with_seed(1);
+    let mut counts = [0; 2];
+    for row in begins[1..].windows(2) {
+        let mut damaged = [&text[..begins[2]], &text[row[0]..row[1]], &text[begins[LINES]..]].concat();
+        // The row in the middle, but for the mark that it begins with, which is the end of the row before.
+        let at = begins[2] + BEGIN.len() + random.usize(..row[1] - row[0] - BEGIN.len());
+        let old = damaged[at];
+        while damaged[at] == old {
+            damaged[at] = random.u8(..);
+        }
+        let source = Cursor::new(damaged);
+        let reader =
+            TraceReader::from_source("damaged", source, Format::Dif, &ReadOptions::default()).unwrap();
+        let (read, wrong): (Vec<_>, Vec<_>) = reader.partition(Result::is_ok);
+        assert!(read.len() + wrong.len() >= 3, "{} and {wrong:?} at {at}", read.len());
+        counts[usize::from(wrong.is_empty())] += 1;
+    }
+    assert!(counts[0] > LINES / 20, "{counts:?}");
 }
 
 fn is_row(format: Format, line: &[u8]) -> bool {

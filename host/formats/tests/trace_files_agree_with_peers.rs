@@ -1,11 +1,8 @@
-//! Other programs read our files and we read theirs: python-can, Wireshark's tshark, can-utils.
-//!
-//! python-can is in `CANTAP_PYTHON`, else `python3`. A peer that is missing is named and its test passes,
-//! unless `CANTAP_REQUIRE_PEERS=1`.
+//! Other programs read our files and we read theirs: python-can, Wireshark's tshark, can-utils. See `peers/mod.rs` for where they are.
 
+mod peers;
 mod traces;
 
-use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -13,52 +10,8 @@ use std::process::Command;
 use cantap_formats::{CsvDialect, Format, ReadOptions, TrcVersion, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::ErrorState;
+use peers::{peers_are_required, python, python_can, python_can_reads, run};
 use traces::{directory, file_name, frames, odd, read, real, split, write};
-
-const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
-
-fn python() -> String {
-    std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned())
-}
-
-fn peers_are_required() -> bool {
-    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
-}
-
-/// A program's output, or `None` after saying that it is missing. One that is there and fails is a failure.
-fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
-    let there = Command::new(command.get_program()).args(probe).output();
-    if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
-        assert!(!peers_are_required(), "{peer} is required and does not run");
-        eprintln!("SKIPPED: {peer} is not installed, so nothing was compared with it");
-        return None;
-    }
-    let output = command.env("TZ", "UTC").output().unwrap();
-    assert!(output.status.success(), "{peer}: {}", String::from_utf8_lossy(&output.stderr));
-    Some(String::from_utf8(output.stdout).unwrap())
-}
-
-fn python_can(arguments: &[&Path], command: &str) -> Option<String> {
-    run("python-can", &["-c", "import can"], Command::new(python()).arg(SCRIPT).arg(command).args(arguments))
-}
-
-/// What python-can reads from files, by file.
-fn python_can_reads(paths: &[PathBuf]) -> Option<BTreeMap<PathBuf, Vec<String>>> {
-    let arguments: Vec<_> = paths.iter().map(PathBuf::as_path).collect();
-    let text = python_can(&arguments, "dump")?;
-    let mut files: BTreeMap<PathBuf, Vec<String>> = BTreeMap::new();
-    let mut current = PathBuf::new();
-    for line in text.lines() {
-        match line.strip_prefix("file ") {
-            Some(path) => {
-                current = path.into();
-                files.insert(current.clone(), Vec::new());
-            }
-            None => files.get_mut(&current).unwrap().push(line.to_owned()),
-        }
-    }
-    Some(files)
-}
 
 /// What a format leaves of a line.
 #[derive(Clone, Copy)]
@@ -122,7 +75,8 @@ fn line(record: &TraceRecord, carries: Carries) -> Option<String> {
     let len = if frame.is_fd() { frame.data_len() as u8 } else { frame.dlc() };
     let len = if frame.is_remote() && !carries.remote_length { 0 } else { len };
     let id = frame.id().raw();
-    Some(format!("{micros} {channel} {direction} {kind} {id:X} {extended} {len} {data}"))
+    let flags = frame.fd().map(|frame| format!(" {}", frame.flags())).unwrap_or_default();
+    Some(format!("{micros} {channel} {direction} {kind} {id:X} {extended} {len} {data}{flags}"))
 }
 
 fn lines(records: &[TraceRecord], carries: Carries) -> Vec<String> {
@@ -254,8 +208,8 @@ fn python_can_reads_the_fd_frames_of_our_mf4() {
     assert_eq!(
         theirs[&path],
         [
-            "1410714882000100 1 Rx fd 123 - 12 000102030405060708090A0B",
-            "1410714882000200 2 Tx fd 18DAF110 x 1 AA",
+            "1410714882000100 1 Rx fd 123 - 12 000102030405060708090A0B 1",
+            "1410714882000200 2 Tx fd 18DAF110 x 1 AA 0",
             "1410714882000300 1 Rx data 7FF - 2 1122",
         ]
     );
@@ -367,8 +321,9 @@ fn python_can_test_data() -> Option<PathBuf> {
                 "download",
                 "--quiet",
                 "--no-deps",
+                // All others in binary: what building this one takes would be built from source, too, which takes minutes.
                 "--no-binary",
-                ":all:",
+                "python-can",
                 "python-can",
                 "-d",
             ])
@@ -411,7 +366,7 @@ const DIFFERENT: &[(&str, &str)] = &[
         "logfile.asc",
         "a remote frame in a CANFD row is a classical one; an error frame is nobody's to have sent",
     ),
-    ("single_frame.asc", "64 bytes in a classical row are an issue here, a message there"),
+    ("single_frame.asc", "64 bytes in a classical row are a CAN FD frame here"),
     ("test_CanErrorFrameExt.blf", "channel 4370 is an issue; and a microsecond is rounded the other way"),
     ("test_CanErrorFrames.asc", "an error frame is nobody's to have sent"),
     ("test_CanFdMessage.blf", "channel 4370 is an issue here"),

@@ -4,7 +4,8 @@ dump FILE...             prints "file PATH", then one line for each message
 write LINES FILE...      writes the messages of such lines into each file, format by suffix
 
 A line is: microseconds, channel from 1 (0 where the format has none), Rx or Tx, data, remote, error or fd,
-identifier in hexadecimal, x if it is extended, length, bytes in hexadecimal.
+identifier in hexadecimal, x if it is extended, length, bytes in hexadecimal; of CAN FD the flags: 1 for a switched
+bit rate, 2 for an error passive sender.
 """
 
 import sys
@@ -31,9 +32,10 @@ def line(message, suffix):
     kind = "fd" if message.is_fd else "remote" if message.is_remote_frame else "data"
     extended = "x" if message.is_extended_id else "-"
     data = bytes(message.data).hex().upper() or "-"
+    flags = f" {message.bitrate_switch + 2 * message.error_state_indicator}" if message.is_fd else ""
     return (
         f"{micros} {channel_from_1(message, suffix)} {direction} {kind} {message.arbitration_id:X} {extended} "
-        f"{message.dlc} {data}"
+        f"{message.dlc} {data}{flags}"
     )
 
 
@@ -64,12 +66,16 @@ def write(lines, paths):
         if kind == "error":
             messages.append(can.Message(is_error_frame=True, **common))
             continue
-        identifier, extended, dlc, data = rest
+        identifier, extended, dlc, data, *flags = rest
+        flags = int(flags[0]) if flags else 0
         messages.append(
             can.Message(
                 arbitration_id=int(identifier, 16),
                 is_extended_id=extended == "x",
                 is_remote_frame=kind == "remote",
+                is_fd=kind == "fd",
+                bitrate_switch=bool(flags & 1),
+                error_state_indicator=bool(flags & 2),
                 dlc=int(dlc),
                 data=None if kind == "remote" or data == "-" else bytes.fromhex(data),
                 check=True,

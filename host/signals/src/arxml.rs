@@ -1,8 +1,8 @@
 //! Databases from ARXML files, AUTOSAR's system descriptions of version 3 and 4.
 //!
 //! A frame's identifier stands where a CAN channel sends it, its signals in the PDUs that are mapped into it, and how their bits become
-//! values in yet other places, named by paths. Container and secured PDUs are not read: their frames keep what else is in them, with a
-//! warning.
+//! values in yet other places, named by paths. Of a secured PDU the payload is read, which stands in front of its authenticator. What a
+//! container PDU holds says each frame anew, so it is not read: its frames keep what else is in them, with a warning.
 
 use std::collections::{HashMap, HashSet};
 
@@ -89,7 +89,14 @@ struct Target<'m> {
     offset: u16,
     signals: Vec<Signal>,
     cycle_ms: Option<u32>,
+    /// How deep the PDU is that is being read, and how many were read for this frame.
+    depth: u32,
+    pdus: u32,
 }
+
+/// PDUs of PDUs go no deeper than this, and no frame has more of them: a file can name one as a part of itself.
+const MOST_DEPTH: u32 = 8;
+const MOST_PDUS: u32 = 1000;
 
 impl<'a> Reader<'a> {
     /// Notes the path of everything below `node`.
@@ -149,7 +156,8 @@ impl<'a> Reader<'a> {
             fault(FaultKind::MessageLength(length.unsigned_abs()));
             return None;
         };
-        let mut target = Target { name: &name, offset: 0, signals: Vec::new(), cycle_ms: None };
+        let mut target =
+            Target { name: &name, offset: 0, signals: Vec::new(), cycle_ms: None, depth: 0, pdus: 0 };
         let mappings = within(frame, "PDU-TO-FRAME-MAPPING");
         for mapping in mappings.collect::<Vec<_>>() {
             let start =
@@ -187,13 +195,33 @@ impl<'a> Reader<'a> {
     }
 
     fn pdu(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
+        target.pdus += 1;
+        if target.depth >= MOST_DEPTH || target.pdus > MOST_PDUS {
+            let reason = "its PDUs are made of each other without an end, or are too many".to_owned();
+            return Err((pdu, FaultKind::Syntax(reason)));
+        }
+        target.depth += 1;
+        let result = self.pdu_of_any_kind(pdu, target);
+        target.depth -= 1;
+        result
+    }
+
+    fn pdu_of_any_kind(
+        &mut self,
+        pdu: Node<'a, 'a>,
+        target: &mut Target,
+    ) -> Result<(), (Node<'a, 'a>, FaultKind)> {
         match pdu.tag_name().name() {
             "MULTIPLEXED-I-PDU" => self.multiplexed(pdu, target),
-            "CONTAINER-I-PDU" | "SECURED-I-PDU" => {
-                let kind = pdu.tag_name().name();
-                self.warn(pdu, target.name, &format!("{} is a {kind}, which is not read", short_name(pdu)));
+            "CONTAINER-I-PDU" => {
+                let name = short_name(pdu);
+                let reason = format!(
+                    "{name} is a container PDU: what a frame holds stands in the frame itself, and is not read"
+                );
+                self.warn(pdu, target.name, &reason);
                 Ok(())
             }
+            "SECURED-I-PDU" => self.secured(pdu, target),
             _ => {
                 target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
                 let mappings = within(pdu, "I-SIGNAL-TO-I-PDU-MAPPING");
@@ -221,6 +249,27 @@ impl<'a> Reader<'a> {
                 Ok(())
             }
         }
+    }
+
+    /// A PDU with the payload of another one in front of what proves who sent it.
+    fn secured(&mut self, pdu: Node<'a, 'a>, target: &mut Target) -> Result<(), (Node<'a, 'a>, FaultKind)> {
+        let name = short_name(pdu);
+        if content(pdu, "USE-AS-CRYPTOGRAPHIC-I-PDU").as_deref() == Some("true") {
+            self.warn(
+                pdu,
+                target.name,
+                &format!("{name} only has the authenticator of a PDU in another frame"),
+            );
+            return Ok(());
+        }
+        target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
+        let triggering = self.reference(pdu, "PAYLOAD-REF");
+        let payload = triggering.and_then(|node| self.reference(node, "I-PDU-REF"));
+        if let Some(payload) = payload {
+            return self.pdu(payload, target);
+        }
+        self.warn(pdu, target.name, &format!("the payload of {name}, a secured PDU, is not in the file"));
+        Ok(())
     }
 
     /// A PDU whose selector says which of several others is in it.

@@ -30,7 +30,7 @@ pub struct MessageRef(u32);
 #[derive(Clone, Debug)]
 pub struct Decoder {
     messages: Vec<(Option<u8>, Message, MessagePlan)>,
-    /// For channels without an own database.
+    /// For channels without a database of their own.
     common: Lookup,
     by_channel: HashMap<u8, Lookup>,
     overrides: Vec<Override>,

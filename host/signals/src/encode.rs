@@ -1,15 +1,22 @@
 //! From values to frames: `EngineData:Speed=1200,Gear=Drive`.
 
+mod error;
+mod parse;
+mod value;
+
 use std::collections::{BTreeMap, BTreeSet};
 
 use cantap_wire::Frame;
 
 use super::decoder::{Decoder, MessageRef};
 use super::fault::MAX_SWITCHES;
-use super::j1939::{self, Indicator};
 use super::layout;
-use super::model::{Message, Multiplexed, Signal, ValueKind};
+use super::model::{Message, Multiplexed, Signal};
 use super::select::Suggestion;
+
+pub use error::EncodeError;
+pub use parse::{Input, parse};
+use value::raw;
 
 /// A frame made from values.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -20,152 +27,6 @@ pub struct Encoded {
     pub message: MessageRef,
     /// The frame to send.
     pub frame: Frame,
-}
-
-/// A value as the user gives it.
-#[derive(Clone, Debug, PartialEq)]
-pub enum Input {
-    /// A physical value: `90`, `-1.5`, `0x1F`.
-    Integer(i128),
-    /// A physical value with a fraction.
-    Real(f64),
-    /// The bits themselves: `raw:0xFF`.
-    Raw(u64),
-    /// A text of the value table: `Drive`, or in quotes.
-    Text(String),
-}
-
-/// Why values make no frame.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[non_exhaustive]
-pub enum EncodeError {
-    /// The text has another form.
-    #[error("{text:?} is no message with values; write it as Message:Signal=value,Signal=value")]
-    Form {
-        /// The text.
-        text: String,
-    },
-    /// No database has the message.
-    #[error("no database has a message {name:?}{near}")]
-    UnknownMessage {
-        /// The name.
-        name: String,
-        /// A name like it.
-        near: Suggestion,
-    },
-    /// Databases of different channels have it.
-    #[error("channels {first} and {second} both have a message {name:?}; choose the channel")]
-    Ambiguous {
-        /// The name.
-        name: String,
-        /// One channel.
-        first: u8,
-        /// Another.
-        second: u8,
-    },
-    /// The message has no such signal.
-    #[error("message {message} has no signal {name:?}{near}")]
-    UnknownSignal {
-        /// The message.
-        message: String,
-        /// The name.
-        name: String,
-        /// A name like it.
-        near: Suggestion,
-    },
-    /// The signal is given twice.
-    #[error("signal {0} is given twice")]
-    Twice(String),
-    /// The text is no number and not in the value table.
-    #[error("{text:?} is no value for {signal}; it takes a number{choices}")]
-    UnknownText {
-        /// The signal.
-        signal: String,
-        /// The text.
-        text: String,
-        /// The texts that it takes, ready to be printed.
-        choices: String,
-    },
-    /// The text stands for several raw values.
-    #[error("{text:?} stands for several values of {signal}; choose one: {choices}")]
-    AmbiguousText {
-        /// The signal.
-        signal: String,
-        /// The text.
-        text: String,
-        /// The values, ready to be written in the text's place.
-        choices: String,
-    },
-    /// A fraction for a signal whose values are states.
-    #[error("{signal} has states and none between them, such as {value}; it takes a whole number{choices}")]
-    Fraction {
-        /// The signal.
-        signal: String,
-        /// The value.
-        value: String,
-        /// The texts that it takes, ready to be printed.
-        choices: String,
-    },
-    /// The signal has too few bits for the value.
-    #[error("{value} does not fit {signal}, which goes from {low} to {high}")]
-    Range {
-        /// The signal.
-        signal: String,
-        /// The value.
-        value: String,
-        /// The smallest it can hold.
-        low: String,
-        /// The largest it can hold.
-        high: String,
-    },
-    /// The database forbids the value.
-    #[error(
-        "the database allows {signal} from {low} to {high}, not {value}; write raw:{raw} to send it all the same"
-    )]
-    Limits {
-        /// The signal.
-        signal: String,
-        /// The value.
-        value: String,
-        /// The smallest allowed.
-        low: f64,
-        /// The largest allowed.
-        high: f64,
-        /// The bits that would be sent.
-        raw: u64,
-    },
-    /// The multiplexer has another value.
-    #[error("{signal} is only there when {switch} is {needed}, and it is {actual}")]
-    Absent {
-        /// The signal.
-        signal: String,
-        /// Its multiplexer.
-        switch: String,
-        /// The values under which the signal is there.
-        needed: String,
-        /// The value that was given.
-        actual: u64,
-    },
-    /// No value of the multiplexer suits all the signals given.
-    #[error("{first} and {second} are never in the same frame ({switch} chooses between them)")]
-    Exclusive {
-        /// One signal.
-        first: String,
-        /// Another.
-        second: String,
-        /// Their multiplexer.
-        switch: String,
-    },
-    /// The message is longer than a frame, or the signal lies beyond it.
-    #[error("{what} needs {bytes} bytes; {room}")]
-    TooLong {
-        /// Message or signal.
-        what: String,
-        /// Bytes it needs.
-        bytes: u32,
-        /// How many there are, in words.
-        room: &'static str,
-    },
 }
 
 /// Makes a frame from `Message:Signal=value,…`.
@@ -183,64 +44,6 @@ pub fn encode(decoder: &Decoder, channel: Option<u8>, text: &str) -> Result<Enco
         room: "a frame has 8",
     })?;
     Ok(Encoded { channel: decoder.channel(reference), message: reference, frame })
-}
-
-/// Splits `Message:Signal=value,…`. A value in double quotes is a text, whatever is in it.
-pub fn parse(text: &str) -> Result<(String, Vec<(String, Input)>), EncodeError> {
-    let form = || EncodeError::Form { text: text.to_owned() };
-    let (name, rest) = text.split_once(':').unwrap_or((text, ""));
-    let name = name.trim();
-    if name.is_empty() {
-        return Err(form());
-    }
-    let mut inputs = Vec::new();
-    let mut rest = rest.trim();
-    while !rest.is_empty() {
-        let (signal, after) = rest.split_once('=').ok_or_else(form)?;
-        let after = after.trim_start();
-        let (input, after) = if let Some(quoted) = after.strip_prefix('"') {
-            let (value, after) = quoted.split_once('"').ok_or_else(form)?;
-            (Input::Text(value.to_owned()), after.trim_start())
-        } else {
-            let end = after.find(',').unwrap_or(after.len());
-            (input(after[..end].trim()), &after[end..])
-        };
-        if signal.trim().is_empty() || input == Input::Text(String::new()) {
-            return Err(form());
-        }
-        inputs.push((signal.trim().to_owned(), input));
-        rest = match after.strip_prefix(',') {
-            Some(more) if !more.trim().is_empty() => more.trim(),
-            None if after.is_empty() => after,
-            _ => return Err(form()),
-        };
-    }
-    Ok((name.to_owned(), inputs))
-}
-
-fn input(text: &str) -> Input {
-    if let Some(raw) = text.strip_prefix("raw:")
-        && let Some(raw) = integer(raw).and_then(|raw| u64::try_from(raw).ok())
-    {
-        return Input::Raw(raw);
-    }
-    match (integer(text), text.parse::<f64>()) {
-        (Some(integer), _) => Input::Integer(integer),
-        // Rust also reads "inf" and "nan", which may well be texts of a value table.
-        (_, Ok(real)) if text.contains(|c: char| c.is_ascii_digit()) => Input::Real(real),
-        _ => Input::Text(text.to_owned()),
-    }
-}
-
-fn integer(text: &str) -> Option<i128> {
-    let (sign, digits) = text.strip_prefix('-').map_or((1, text), |digits| (-1, digits));
-    let magnitude = match digits.strip_prefix("0x").or_else(|| digits.strip_prefix("0X")) {
-        Some(hex) if !hex.starts_with('+') => u128::from_str_radix(hex, 16).ok()?,
-        _ if digits.starts_with('+') => return None,
-        _ => digits.parse().ok()?,
-    };
-    // A 64-bit value times any factor that makes sense; and nothing below can overflow.
-    i128::try_from(magnitude).ok().filter(|magnitude| *magnitude < 1 << 120).map(|magnitude| sign * magnitude)
 }
 
 fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<MessageRef, EncodeError> {
@@ -393,157 +196,4 @@ fn values(ranges: &[std::ops::RangeInclusive<u64>]) -> String {
         })
         .collect();
     texts.join(" or ")
-}
-
-/// The bits for a value.
-fn raw(message: &Message, signal: &Signal, input: &Input) -> Result<u64, EncodeError> {
-    let mask = layout::mask(signal.length);
-    let (physical, text) = match input {
-        Input::Raw(raw) if *raw <= mask => return Ok(*raw),
-        Input::Raw(raw) => return Err(range_error(signal, format!("raw:{raw}"))),
-        Input::Text(text) => return raw_of_text(message, signal, text),
-        Input::Integer(value) => (*value as f64, value.to_string()),
-        Input::Real(value) => (*value, value.to_string()),
-    };
-    let unscaled = (physical - signal.offset) / signal.factor;
-    let raw = match input {
-        Input::Integer(value) if signal.integer(0).is_some() => {
-            raw_of_integer(signal, unscaled_integer(signal, *value, physical))
-        }
-        // A float beyond 64 bits becomes the largest integer, which no signal can hold.
-        _ if signal.integer(0).is_some() => raw_of_integer(signal, unscaled.round_ties_even() as i128),
-        _ => raw_of_float(signal, unscaled),
-    };
-    let raw = raw.filter(|_| physical.is_finite()).ok_or_else(|| range_error(signal, text.clone()))?;
-    if !signal.values.is_empty()
-        && signal.integer(0).is_some()
-        && (unscaled - unscaled.round()).abs() > STEP_ERROR
-    {
-        let choices = choices(signal);
-        return Err(EncodeError::Fraction { signal: signal.name.clone(), value: text, choices });
-    }
-    let (low, high) = (signal.min.unwrap_or(f64::NEG_INFINITY), signal.max.unwrap_or(f64::INFINITY));
-    if !is_within(signal, physical, low, high) {
-        return Err(EncodeError::Limits { signal: signal.name.clone(), value: text, low, high, raw });
-    }
-    Ok(raw)
-}
-
-/// Share of a step between two raw values that calculating with floats may cost.
-const STEP_ERROR: f64 = 1e-6;
-
-/// Whether a value is between limits, which a file gives in decimals that neither a factor nor a short float may be able to meet
-/// exactly: 204.70000000000002 is 204.7, and so is a float of 32 bits that is nearest to it.
-fn is_within(signal: &Signal, physical: f64, low: f64, high: f64) -> bool {
-    let nearest = |limit: f64| match signal.integer(0) {
-        Some(_) => None,
-        None => raw_of_float(signal, (limit - signal.offset) / signal.factor).map(|raw| signal.physical(raw)),
-    };
-    let slack = if signal.integer(0).is_some() { signal.factor.abs() * STEP_ERROR } else { 0.0 };
-    let low = nearest(low).map_or(low, |nearest| nearest.min(low)) - slack;
-    let high = nearest(high).map_or(high, |nearest| nearest.max(high)) + slack;
-    (low..=high).contains(&physical)
-}
-
-/// The bits for a text of the value table, or for what J1939 says in place of a value. The database's limits do not apply.
-fn raw_of_text(message: &Message, signal: &Signal, text: &str) -> Result<u64, EncodeError> {
-    let values = signal.values.values(text);
-    let raws: Vec<_> = values
-        .iter()
-        .filter_map(|&value| {
-            raw_of_integer(signal, value.into()).or_else(|| raw_of_float(signal, value as f64))
-        })
-        .collect();
-    match raws[..] {
-        [raw] => Ok(raw),
-        [] if !values.is_empty() => Err(range_error(signal, text.to_owned())),
-        [] => {
-            let indicators = [Indicator::Error, Indicator::NotAvailable].into_iter();
-            let mut meant = indicators.filter(|indicator| message.j1939 && indicator.name() == text);
-            let raw = meant.find_map(|indicator| j1939::raw_of(signal, indicator));
-            raw.ok_or_else(|| unknown_text(signal, text))
-        }
-        _ => {
-            let choices: Vec<_> = raws.iter().map(|raw| format!("raw:{raw}")).collect();
-            let choices = choices.join(", ");
-            Err(EncodeError::AmbiguousText { signal: signal.name.clone(), text: text.to_owned(), choices })
-        }
-    }
-}
-
-fn unknown_text(signal: &Signal, text: &str) -> EncodeError {
-    let choices = choices(signal);
-    EncodeError::UnknownText { signal: signal.name.clone(), text: text.to_owned(), choices }
-}
-
-/// The texts that a signal takes, as the end of a sentence; each once.
-fn choices(signal: &Signal) -> String {
-    /// A longer list hides the message.
-    const SHOWN: usize = 12;
-    let mut texts: Vec<&str> = Vec::new();
-    for (_, text) in signal.values.iter() {
-        if !texts.contains(&text) {
-            texts.push(text);
-        }
-        if texts.len() > SHOWN {
-            texts[SHOWN] = "…";
-            break;
-        }
-    }
-    if texts.is_empty() { String::new() } else { format!(" or one of: {}", texts.join(", ")) }
-}
-
-fn range_error(signal: &Signal, value: String) -> EncodeError {
-    let mask = layout::mask(signal.length);
-    let (low, high) = match signal.kind {
-        ValueKind::Unsigned => (0, mask),
-        ValueKind::Signed => (mask / 2 + 1, mask / 2),
-        ValueKind::SignMagnitude => (mask, mask / 2),
-        ValueKind::Half => (0xFBFF, 0x7BFF),
-        ValueKind::Single => (u64::from(f32::MIN.to_bits()) >> (32 - signal.length.min(32)), {
-            u64::from(f32::MAX.to_bits()) >> (32 - signal.length.min(32))
-        }),
-        ValueKind::Double => {
-            (f64::MIN.to_bits() >> (64 - signal.length), f64::MAX.to_bits() >> (64 - signal.length))
-        }
-    };
-    let (mut low, mut high) = (signal.number(low), signal.number(high));
-    if low.as_f64() > high.as_f64() {
-        std::mem::swap(&mut low, &mut high);
-    }
-    EncodeError::Range { signal: signal.name.clone(), value, low: low.to_string(), high: high.to_string() }
-}
-
-/// Undoes factor and offset, exactly where that can be done.
-fn unscaled_integer(signal: &Signal, value: i128, physical: f64) -> i128 {
-    let (factor, offset) = (signal.factor as i128, signal.offset as i128);
-    let whole = signal.factor.fract() == 0.0 && signal.offset.fract() == 0.0 && factor != 0;
-    match value.checked_sub(offset) {
-        Some(difference) if whole && difference % factor == 0 => difference / factor,
-        _ => ((physical - signal.offset) / signal.factor).round_ties_even() as i128,
-    }
-}
-
-fn raw_of_integer(signal: &Signal, value: i128) -> Option<u64> {
-    let mask = layout::mask(signal.length);
-    let raw = match signal.kind {
-        ValueKind::SignMagnitude if value < 0 => {
-            let magnitude =
-                u64::try_from(value.checked_neg()?).ok().filter(|&magnitude| magnitude <= mask >> 1)?;
-            magnitude | mask ^ mask >> 1
-        }
-        _ => value as u64 & mask,
-    };
-    // Whatever does not read back as the value does not fit.
-    (signal.integer(raw)? == value).then_some(raw)
-}
-
-fn raw_of_float(signal: &Signal, value: f64) -> Option<u64> {
-    let raw = match signal.kind {
-        ValueKind::Half => half::f16::from_f64(value).to_bits().into(),
-        ValueKind::Single => u64::from((value as f32).to_bits()) >> (32 - signal.length.min(32)),
-        ValueKind::Double => value.to_bits() >> (64 - signal.length),
-        _ => return None,
-    };
-    signal.raw_to_f64(raw).is_finite().then_some(raw)
 }

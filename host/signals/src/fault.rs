@@ -45,7 +45,7 @@ fn list(file: &str, faults: &[Fault]) -> String {
     text.join("\n")
 }
 
-/// Most multiplexers, one behind the other, that a signal may depend on. Databases have two or three.
+/// Most multiplexers, one after another, that a signal may depend on. Databases have two or three.
 pub(super) const MAX_SWITCHES: usize = 16;
 
 /// One thing that is wrong in a database.

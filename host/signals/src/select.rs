@@ -15,7 +15,7 @@ pub struct Selection {
     patterns: Vec<Pattern>,
 }
 
-/// Why a pattern is of no use.
+/// Why a pattern cannot be used.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum SelectionError {

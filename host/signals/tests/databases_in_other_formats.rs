@@ -91,6 +91,64 @@ fn an_arxml_file_is_read() {
     assert_eq!(arxml::parse("x.arxml", &wide).unwrap().messages[0].signals[0].unit, "°C");
 }
 
+#[test]
+fn the_payload_of_a_secured_pdu_is_read_and_of_a_container_it_is_said_that_it_is_not() {
+    let secured = |more: &str| {
+        let pdus = format!(
+            "<SECURED-I-PDU><SHORT-NAME>Safe</SHORT-NAME><LENGTH>3</LENGTH><PAYLOAD-REF>/P/C/Tr</PAYLOAD-REF>{more}</SECURED-I-PDU>
+             <X><SHORT-NAME>C2</SHORT-NAME></X><CONTAINER-I-PDU><SHORT-NAME>Box</SHORT-NAME></CONTAINER-I-PDU><I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>"
+        );
+        let text = ARXML
+            .replace("<PDU-REF>/P/Pdu</PDU-REF>", "<PDU-REF>/P/Safe</PDU-REF>")
+            .replace("<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>", &pdus)
+            .replace("<X><CAN-FRAME-TRIGGERING>", "<X><PDU-TRIGGERING><SHORT-NAME>Tr</SHORT-NAME><I-PDU-REF>/P/Pdu</I-PDU-REF></PDU-TRIGGERING><CAN-FRAME-TRIGGERING>");
+        arxml::parse("x.arxml", text.as_bytes()).unwrap()
+    };
+    let database = secured("");
+    assert_eq!(database.messages[0].cycle_ms, Some(250));
+    assert_eq!(decode(database, "00000123#00FFF6"), "Sig=-0.5°C");
+    let warnings = |database: Database| {
+        let mut texts =
+            database.warnings.iter().map(ToString::to_string).filter(|text| !text.contains("/P/Gone"));
+        texts.next().unwrap()
+    };
+    let elsewhere = secured("<USE-AS-CRYPTOGRAPHIC-I-PDU>true</USE-AS-CRYPTOGRAPHIC-I-PDU>");
+    assert!(elsewhere.messages[0].signals.is_empty());
+    assert!(warnings(elsewhere).contains("Safe only has the authenticator"));
+    let gone = arxml::parse("x.arxml", ARXML.replace("I-SIGNAL-I-PDU>", "SECURED-I-PDU>").as_bytes());
+    assert!(warnings(gone.unwrap()).contains("the payload of Pdu, a secured PDU, is not in the file"));
+    let container = ARXML.replace("I-SIGNAL-I-PDU>", "CONTAINER-I-PDU>");
+    assert!(
+        warnings(arxml::parse("x.arxml", container.as_bytes()).unwrap()).contains("Pdu is a container PDU")
+    );
+}
+
+/// Each PDU is a part of itself, once and many times over: the first ended the program, the second would have taken years.
+#[test]
+fn pdus_that_are_parts_of_themselves_leave_their_frame_out() {
+    for parts in [1, 40] {
+        let part = "<STATIC-PART><I-PDU-REF>/P/Pdu</I-PDU-REF></STATIC-PART>".repeat(parts);
+        let text = ARXML
+            .replace(
+                "<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>",
+                &format!("<MULTIPLEXED-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>{part}"),
+            )
+            .replace("</I-SIGNAL-I-PDU>", "</MULTIPLEXED-I-PDU>");
+        let error = arxml::parse("x.arxml", text.as_bytes()).map(|database| database.warnings);
+        let texts = match error {
+            Ok(warnings) => warnings.iter().map(ToString::to_string).collect(),
+            Err(error) => error.to_string(),
+        };
+        assert!(texts.contains("without an end"), "{texts}");
+    }
+    let text = ARXML
+        .replace("<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>", "<SECURED-I-PDU><SHORT-NAME>Pdu</SHORT-NAME><PAYLOAD-REF>/P/C/Tr</PAYLOAD-REF>")
+        .replace("</I-SIGNAL-I-PDU>", "</SECURED-I-PDU>")
+        .replace("<X><CAN-FRAME-TRIGGERING>", "<X><PDU-TRIGGERING><SHORT-NAME>Tr</SHORT-NAME><I-PDU-REF>/P/Pdu</I-PDU-REF></PDU-TRIGGERING><CAN-FRAME-TRIGGERING>");
+    let result = arxml::parse("x.arxml", text.as_bytes());
+    assert!(result.is_err() || result.is_ok_and(|database| database.messages.is_empty()));
+}
+
 type Parse = fn(&str, &[u8]) -> Result<Database, DatabaseError>;
 
 #[test]

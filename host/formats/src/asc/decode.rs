@@ -178,6 +178,9 @@ impl Decoder {
         let (dlc, rest) = text::word(rest);
         let frame = match kind {
             b"d" | b"D" => {
+                if let Some(frame) = self.long(id, dlc, rest) {
+                    return Ok(OnChannel::Event(TraceEvent::Frame { frame, direction, late: false }));
+                }
                 let dlc = self.dlc(dlc)?;
                 let len = dlc.min(8);
                 let data = self.data(rest, len)?;
@@ -191,6 +194,25 @@ impl Decoder {
             other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
         };
         Ok(OnChannel::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
+    }
+
+    /// A CAN FD frame among the classical ones, as earlier versions of python-can wrote it: with the number of its bytes, two digits,
+    /// in the place of the length code.
+    #[inline]
+    fn long(&self, id: Id, len: &[u8], columns: &[u8]) -> Option<TraceFrame> {
+        if len.len() != 2 {
+            return None;
+        }
+        let len = if self.decimal { text::decimal(len)? } else { u64::from(text::hex(len)?) } as usize;
+        let mut words = columns.split(u8::is_ascii_whitespace).filter(|word| !word.is_empty());
+        let mut data = [0; FD_MAX_BYTES];
+        for slot in data.get_mut(..len).filter(|data| data.len() > 8)? {
+            *slot = self.byte(words.next()?)?;
+        }
+        if words.next().is_some_and(|word| self.byte(word).is_some()) {
+            return None;
+        }
+        FdFrame::new(id, false, false, &data[..len]).map(TraceFrame::Fd)
     }
 
     /// Whether a last line that looks whole, and has no line end, may have lost the end of what it says: all but a frame
@@ -250,8 +272,8 @@ impl Decoder {
         }
         let (_duration, _bits, word) = (next(), next(), next());
         let flags = text::hex(word).ok_or_else(|| Fault::malformed("flags in hexadecimal digits", word))?;
-        // Programs are about that leave the flags out; more than eight bytes say it too.
-        let frame = if flags & FD_FORMAT != 0 || len > 8 {
+        // There are programs that leave the flags out; what only an FD frame has says it too.
+        let frame = if flags & FD_FORMAT != 0 || len > 8 || brs || esi {
             let frame = FdFrame::new(id, brs, esi, &data[..len]);
             frame.filter(|_| usize::from(FD_LENGTHS[usize::from(dlc)]) == len).map(TraceFrame::Fd)
         } else {

@@ -9,13 +9,13 @@ use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::sja1000;
 use super::super::zone::Zone;
+use super::object::KINDS;
 use super::{
     BASE_HEADER_BYTES, CAN_ERROR_EXT, CAN_FD_MESSAGE, CAN_MESSAGE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
     DATA_LOST_END, EVENT_COMMENT, EXTENDED, FD_FORMAT, FD_PASSIVE_SENDER, FD_SWITCHED_BIT_RATE,
     FILE_HEADER_BYTES, FILE_MAGIC, HAS_SJA1000_CODE, HEADER_BYTES, LOG_CONTAINER, OBJECT_MAGIC, OWN_MARK,
     REMOTE, SENT, TIME_IN_NS,
 };
-use crate::blf::decode::KINDS;
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 /// Bytes of objects per container, as Vector's own writer has it.

@@ -182,8 +182,11 @@ fn collect(
             identification.get(..8).unwrap_or(&identification),
         ));
     }
-    if identification.get(8..10).is_some_and(|version| version != b"4.") {
-        let version = String::from_utf8_lossy(&identification[8..12]).trim().to_owned();
+    let Some(version) = identification.get(8..12) else {
+        return Err(Fault::Truncated("the file header"));
+    };
+    if !version.starts_with(b"4.") {
+        let version = String::from_utf8_lossy(version).trim().to_owned();
         return Err(Fault::Unsupported(format!("MDF {version}, which is older than 4.0,").into()));
     }
     let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };

@@ -205,7 +205,7 @@ const FRAMES: [(&str, Events); 10] = [
     ("K_LINE", Events::Other("events of K-Line")),
 ];
 
-/// A channel with what it is made of, one behind the other.
+/// A channel with what it is made of, one after another.
 struct Channel {
     name: String,
     block: Block,

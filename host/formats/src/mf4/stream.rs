@@ -207,7 +207,7 @@ fn unpack(file: &mut Whole, piece: Piece, packed: Packed) -> Result<Vec<u8>, Fau
     Ok(bytes)
 }
 
-/// Columns one behind the other as rows. What is no whole row stands unchanged at the end.
+/// Columns one after another as rows. What is no whole row stands unchanged at the end.
 fn exchange(columns_first: &[u8], columns: usize) -> Vec<u8> {
     let rows = columns_first.len() / columns;
     let mut bytes = columns_first.to_vec();

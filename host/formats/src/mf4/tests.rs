@@ -170,6 +170,20 @@ fn bytes_in_records_of_another_group_are_found_before_and_behind_also_by_their_o
     }
 }
 
+/// Found by random damage: a cut behind the version's first digits ended the program.
+#[test]
+fn a_file_cut_in_its_first_bytes_is_named() {
+    for len in 8..64 {
+        let (log, issues) = as_log(&b"MDF     4.10    asammdf 8.8.28          "[..len.min(40)]);
+        assert!(
+            log.is_empty() && issues.len() == 1 && issues[0].contains("ends inside"),
+            "{len}: {issues:?}"
+        );
+    }
+    let (_, issues) = as_log(b"MDF     3.30    ");
+    assert!(issues.len() == 1 && issues[0].contains("MDF 3.30"), "{issues:?}");
+}
+
 #[test]
 fn what_is_no_mdf_4_is_named() {
     for (file, message) in [

@@ -1,0 +1,264 @@
+//! Reading candump's log.
+
+use std::io;
+
+use cantap_wire::{Frame, Id};
+
+use super::super::codec::{BATCH, Decode};
+use super::super::error_frames::ErrorFrames;
+use super::super::found::Found;
+use super::super::input::Input;
+use super::super::interfaces::Interfaces;
+use super::super::issue::Fault;
+use super::super::text::{self, NS_PER_S};
+use super::lengths::Lengths;
+use cantap_trace::fd::{FD_MAX_BYTES, FLAG_BRS, FLAG_ESI, FLAG_FDF};
+use cantap_trace::socketcan::ERROR_FLAG;
+use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+
+const EXPECTED: &str = "a log line such as '(1410714882.622188) can0 123#DEADBEEF'";
+
+/// Reads the format.
+#[derive(Default)]
+pub(crate) struct Decoder {
+    interfaces: Interfaces,
+    error_frames: ErrorFrames,
+    lengths: Lengths,
+    /// The last line looked whole and had no line end.
+    end_missing: bool,
+    /// The last second's digits and time: most lines are in the same second as the one before.
+    second: [u8; 10],
+    second_ns: i64,
+}
+
+impl Decode for Decoder {
+    fn next(&mut self, input: &mut Input) -> io::Result<Found> {
+        if let Some(found) = self.error_frames.next() {
+            return Ok(found);
+        }
+        while let Some(line) = input.line()? {
+            let text = line.text.trim_ascii();
+            if matches!(text.first(), None | Some(b'#')) && !line.too_long {
+                continue;
+            }
+            return Ok(match self.parse(text) {
+                Ok((record, _)) if !line.terminated && self.was_cut(line.text, &record) => line.cut(),
+                Ok((record, second)) => {
+                    self.end_missing = !line.terminated;
+                    if let Some(frame) = record.frame().filter(|frame| !frame.is_remote()) {
+                        self.lengths.note(frame.id(), frame.dlc());
+                    }
+                    self.error_frames.keep(second.map(|event| TraceRecord { event, ..record }));
+                    Found::Record(record)
+                }
+                Err(_) if line.terminated && is_xl(text) => Found::LeftOut("CAN XL frames"),
+                Err(fault) => line.issue(fault),
+            });
+        }
+        if std::mem::take(&mut self.end_missing) {
+            return Ok(Found::Note("the last line has no end: it may have been longer"));
+        }
+        Ok(Found::End)
+    }
+
+    /// Lines exactly as candump writes them are read where they are in the buffer; the others one by one.
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            if self.error_frames.is_empty() {
+                let (mut used, mut lines) = (0, 0);
+                let buffered = input.buffered();
+                while records.len() < BATCH
+                    && let Some((record, len)) = self.plain(&buffered[used..])
+                {
+                    records.push(record);
+                    used += len;
+                    lines += 1;
+                }
+                input.consume_lines(used, lines);
+            }
+            if records.len() >= BATCH || !records.is_empty() && input.may_wait() && !input.has_line() {
+                return Ok(None);
+            }
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+        }
+    }
+}
+
+impl Decoder {
+    /// The line that `text` begins with, if it is a data frame exactly as candump writes it, with ten digits of seconds,
+    /// as most lines are, and its length with its end. Everything is at its place, so nothing is searched for. `None` is
+    /// no verdict: [`Self::parse`] looks at the line then.
+    #[inline]
+    pub(super) fn plain(&mut self, text: &[u8]) -> Option<(TraceRecord, usize)> {
+        let (time, rest) = text.split_first_chunk::<20>()?;
+        let [b'(', seconds @ .., b'.', u0, u1, u2, u3, u4, u5, b')', b' '] = time else { return None };
+        let seconds: &[u8; 10] = seconds.first_chunk()?;
+        if *seconds != self.second {
+            // Ten digits reach beyond the year 2262, where nanoseconds no longer fit.
+            self.second_ns = text::digits(seconds)?.checked_mul(NS_PER_S)?;
+            self.second = *seconds;
+        }
+        let us = text::digits(&[*u0, *u1, *u2, *u3, *u4, *u5])?;
+        let time_ns = self.second_ns.checked_add(us * 1000)?;
+        let (interface, rest) = split_at_byte(rest, b' ')?;
+        if interface.is_empty() {
+            return None;
+        }
+        let (id, rest) = match rest {
+            [a, b, c, d, e, f, g, h, b'#', rest @ ..] => {
+                (Id::extended(text::hex(&[*a, *b, *c, *d, *e, *f, *g, *h])?)?, rest)
+            }
+            [a, b, c, b'#', rest @ ..] => (Id::standard(text::hex(&[*a, *b, *c])?)?, rest),
+            _ => return None,
+        };
+        let (data, len, rest) = match rest.split_first_chunk::<16>() {
+            Some((digits, rest)) if let Some(data) = text::eight_bytes(digits) => (data, 8, rest),
+            _ => {
+                let digits = rest.iter().take_while(|digit| text::hex_digit(**digit).is_some()).count();
+                let (data, len) = bytes(&rest[..digits])?;
+                (data, len, &rest[digits..])
+            }
+        };
+        let (direction, rest) = match rest {
+            [b' ', b'T', rest @ ..] => (Direction::Tx, rest),
+            [b' ', b'R', rest @ ..] | rest => (Direction::Rx, rest),
+        };
+        let [b'\n', rest @ ..] = rest else { return None };
+        // Only now: a line that is refused must not name an interface.
+        let channel = self.interfaces.channel(interface);
+        let frame = Frame::from_bus(id, false, len, data);
+        self.lengths.note(id, len);
+        let event = TraceEvent::Frame { frame: frame.into(), direction, late: false };
+        Some((TraceRecord { time_ns, channel, event }, text.len() - rest.len()))
+    }
+
+    /// Whether a line without its end, which reads as `record`, lost a part of it. A complete log may lack the last line
+    /// end, and a cut line may look whole: what counts is whether the identifier had longer frames before.
+    fn was_cut(&self, line: &[u8], record: &TraceRecord) -> bool {
+        match record.frame() {
+            Some(frame) if line.ends_with(b" ") || frame.is_remote() => {
+                !frame.is_remote() || line.ends_with(b" ")
+            }
+            Some(frame) if frame.dlc() == 8 && !frame.is_fd() => false,
+            // A file of one line was hardly cut; in others an identifier seldom comes for the first time in the last one.
+            Some(frame) => match self.lengths.of(frame.id()) {
+                Some(longest) => longest > frame.dlc(),
+                None => self.lengths.any,
+            },
+            None => line.len() - line.iter().position(|byte| *byte == b'#').unwrap_or(0) <= 16,
+        }
+    }
+
+    /// One line's record, and a second event if it says two things.
+    #[inline]
+    pub(super) fn parse(&mut self, line: &[u8]) -> Result<(TraceRecord, Option<TraceEvent>), Fault> {
+        let malformed = || Fault::malformed(EXPECTED, line);
+        let rest = line.strip_prefix(b"(").ok_or_else(malformed)?;
+        let (time, rest) = split_at_byte(rest, b')').ok_or_else(malformed)?;
+        let time_ns = text::time(time, NS_PER_S, b'.')
+            .ok_or_else(|| Fault::malformed("a time in seconds between the parentheses", time))?;
+        let (interface, rest) = text::word(rest);
+        let (frame, rest) = text::word(rest);
+        let (id, data) = split_at_byte(frame, b'#').ok_or_else(malformed)?;
+        let direction = match rest.trim_ascii() {
+            b"" | b"R" | b"r" => Direction::Rx,
+            b"T" | b"t" => Direction::Tx,
+            other => return Err(Fault::malformed("'R', 'T' or nothing behind the frame", other)),
+        };
+        let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
+        let channel = self.interfaces.channel(interface);
+        if id.len() == 8 && raw & ERROR_FLAG != 0 {
+            let (bytes, _) = bytes(data).ok_or_else(|| Fault::malformed("up to eight data bytes", data))?;
+            let (event, second) = self.error_frames.read(raw, bytes);
+            return Ok((TraceRecord { time_ns, channel, event }, second));
+        }
+        let id = match id.len() {
+            3 => Id::standard(raw),
+            8 => Id::extended(raw),
+            _ => None,
+        };
+        let id = id.ok_or_else(|| {
+            Fault::malformed("an identifier of 3 digits up to 7FF or 8 up to 1FFFFFFF", frame)
+        })?;
+        let frame = match data {
+            [b'#', fd @ ..] => flexible(id, fd).ok_or_else(|| {
+                Fault::malformed("a CAN FD frame such as 123##1DEADBEEF, with a length that FD has", frame)
+            })?,
+            _ => payload(id, data)?.into(),
+        };
+        let event = TraceEvent::Frame { frame, direction, late: false };
+        Ok((TraceRecord { time_ns, channel, event }, None))
+    }
+}
+
+/// Whether a line has a CAN XL frame: three hexadecimal numbers with colons behind the first `#`, then the data.
+fn is_xl(line: &[u8]) -> bool {
+    let (_, rest) = text::word(line);
+    let (frame, _) = text::word(text::word(rest).1);
+    let mut parts = frame.split(|byte| *byte == b'#');
+    let (Some(priority), Some(fields), Some(_)) = (parts.next(), parts.next(), parts.next()) else {
+        return false;
+    };
+    let fields: Vec<_> =
+        fields.split(|byte| *byte == b':').map(|digits| (digits.len(), text::hex(digits))).collect();
+    text::hex(priority).is_some() && matches!(fields[..], [(2, Some(_)), (2, Some(_)), (8, Some(_))])
+}
+
+/// What stands before and after the first `byte`.
+#[inline]
+fn split_at_byte(text: &[u8], byte: u8) -> Option<(&[u8], &[u8])> {
+    let at = text.iter().position(|&other| other == byte)?;
+    Some((&text[..at], &text[at + 1..]))
+}
+
+/// Up to eight bytes, with or without dots between them.
+#[inline]
+fn bytes(mut digits: &[u8]) -> Option<([u8; 8], u8)> {
+    let mut data = [0; 8];
+    let mut len = 0;
+    while let [high, low, rest @ ..] = digits {
+        *data.get_mut(len)? = text::hex_pair(*high, *low)?;
+        len += 1;
+        digits = match rest {
+            [b'.', more @ ..] if !more.is_empty() => more,
+            _ => rest,
+        };
+    }
+    digits.is_empty().then_some((data, len as u8))
+}
+
+/// What follows the `##`: a digit of flags, then the data. `None` if it is not that.
+fn flexible(id: Id, text: &[u8]) -> Option<TraceFrame> {
+    let (flags, mut digits) = text.split_first()?;
+    let flags = text::hex_digit(*flags).filter(|flags| flags & !(FLAG_BRS | FLAG_ESI | FLAG_FDF) == 0)?;
+    let mut data = [0; FD_MAX_BYTES];
+    let mut len = 0;
+    while let [high, low, rest @ ..] = digits {
+        *data.get_mut(len)? = text::hex_pair(*high, *low)?;
+        len += 1;
+        digits = match rest {
+            [b'.', more @ ..] if !more.is_empty() => more,
+            _ => rest,
+        };
+    }
+    if !digits.is_empty() {
+        return None;
+    }
+    FdFrame::new(id, flags & FLAG_BRS != 0, flags & FLAG_ESI != 0, &data[..len]).map(TraceFrame::Fd)
+}
+
+/// What follows the `#`.
+#[inline]
+fn payload(id: Id, digits: &[u8]) -> Result<Frame, Fault> {
+    if let Some((data, len)) = bytes(digits) {
+        return Ok(Frame::from_bus(id, false, len, data));
+    }
+    // Remote frames and DLCs above 8 are rare: the frame's own text form understands them.
+    let text = format!("{id}#{}", String::from_utf8_lossy(digits));
+    text.parse().map_err(|error: cantap_wire::frame::ParseFrameError| {
+        Fault::malformed(format!("a frame such as 123#DEADBEEF ({error})"), text.as_bytes())
+    })
+}

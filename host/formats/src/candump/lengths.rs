@@ -1,0 +1,45 @@
+//! How long an identifier's frames were, which tells a cut last line from a short frame.
+
+use cantap_wire::Id;
+
+/// How long the longest data frames of recent identifiers were.
+pub(super) struct Lengths {
+    places: Box<[(u32, u8); Self::PLACES]>,
+    /// There was a data frame.
+    pub(super) any: bool,
+}
+
+impl Lengths {
+    /// More identifiers than most buses have, and little enough for the processor's cache.
+    const PLACES: usize = 512;
+    const EXTENDED: u32 = 1 << 31;
+
+    #[inline]
+    fn key(id: Id) -> (usize, u32) {
+        let raw = id.raw();
+        let place = (raw ^ raw >> 9 ^ raw >> 18) as usize % Self::PLACES;
+        (place, raw | if id.is_extended() { Self::EXTENDED } else { 0 })
+    }
+
+    #[inline]
+    pub(super) fn note(&mut self, id: Id, dlc: u8) {
+        let (place, key) = Self::key(id);
+        let (known, longest) = &mut self.places[place];
+        *longest = if *known == key { dlc.max(*longest) } else { dlc };
+        *known = key;
+        self.any = true;
+    }
+
+    pub(super) fn of(&self, id: Id) -> Option<u8> {
+        let (place, key) = Self::key(id);
+        let (known, len) = self.places[place];
+        (known == key).then_some(len)
+    }
+}
+
+impl Default for Lengths {
+    fn default() -> Self {
+        // No identifier has these bits.
+        Self { places: Box::new([(u32::MAX, 0); Self::PLACES]), any: false }
+    }
+}

@@ -1,0 +1,55 @@
+//! Other people's programs, which read our files and write some that we read.
+//!
+//! python-can is in `CANTAP_PYTHON`, else `python3`. A peer that is missing is named and its test passes,
+//! unless `CANTAP_REQUIRE_PEERS=1`.
+
+#![allow(dead_code, reason = "each test file uses some of them")]
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+const SCRIPT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/trace_peer.py");
+
+pub fn python() -> String {
+    std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned())
+}
+
+pub fn peers_are_required() -> bool {
+    std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1")
+}
+
+/// A program's output, or `None` after saying that it is missing. One that is there and fails is a failure.
+pub fn run(peer: &str, probe: &[&str], command: &mut Command) -> Option<String> {
+    let there = Command::new(command.get_program()).args(probe).output();
+    if !there.is_ok_and(|output| output.status.success() || probe.is_empty()) {
+        assert!(!peers_are_required(), "{peer} is required and does not run");
+        eprintln!("SKIPPED: {peer} is not installed, so nothing was compared with it");
+        return None;
+    }
+    let output = command.env("TZ", "UTC").output().unwrap();
+    assert!(output.status.success(), "{peer}: {}", String::from_utf8_lossy(&output.stderr));
+    Some(String::from_utf8(output.stdout).unwrap())
+}
+
+pub fn python_can(arguments: &[&Path], command: &str) -> Option<String> {
+    run("python-can", &["-c", "import can"], Command::new(python()).arg(SCRIPT).arg(command).args(arguments))
+}
+
+/// What python-can reads from files, by file.
+pub fn python_can_reads(paths: &[PathBuf]) -> Option<BTreeMap<PathBuf, Vec<String>>> {
+    let arguments: Vec<_> = paths.iter().map(PathBuf::as_path).collect();
+    let text = python_can(&arguments, "dump")?;
+    let mut files: BTreeMap<PathBuf, Vec<String>> = BTreeMap::new();
+    let mut current = PathBuf::new();
+    for line in text.lines() {
+        match line.strip_prefix("file ") {
+            Some(path) => {
+                current = path.into();
+                files.insert(current.clone(), Vec::new());
+            }
+            None => files.get_mut(&current).unwrap().push(line.to_owned()),
+        }
+    }
+    Some(files)
+}

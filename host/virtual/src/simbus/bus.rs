@@ -149,7 +149,7 @@ impl SimBus {
         matches!(self.phase, Phase::Free { .. })
     }
 
-    /// The bus's bit rate, once anybody takes part. Simulated nodes are silent while nobody listens.
+    /// The bus's bit rate, once a node takes part. Simulated nodes are silent while none listens.
     fn rate(&self, nodes: &[&mut dyn Node]) -> Option<u32> {
         let watched = self.watched.then_some(WATCHED_BPS);
         let joined = nodes.iter().find_map(|node| node.bitrate_bps()).or(watched)?;

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone};
 use cantap_trace::filter::Filter;
@@ -13,7 +13,7 @@ use crate::completion;
 use crate::input::ReadArgs;
 use crate::interrupt;
 use crate::missing::by_kind;
-use crate::trace_output::{TraceOutput, failed};
+use crate::trace_output::{TraceOutput, named};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -126,12 +126,7 @@ impl WriteArgs {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
-    let mut options = args.write.options(None)?;
-    if options.format.is_none() && args.output.as_os_str() != "-" {
-        let format = Format::of_path(&args.output);
-        let format = format.map_err(|error| std::io::Error::new(std::io::ErrorKind::InvalidInput, error));
-        options.format = Some(format.with_context(|| failed(&args.output))?);
-    }
+    let options = named(args.write.options(None)?, &args.output)?;
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
     let read = ReadArgs { format: args.from, follow: args.follow, strict: args.strict, filter, zone };

@@ -25,6 +25,7 @@ use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
 use crate::missing::Missing;
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -86,7 +87,9 @@ struct Count {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     if databases.is_empty() {
-        anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
+        return Err(wrong(
+            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml)",
+        ));
     }
     let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());

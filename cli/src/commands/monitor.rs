@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap::wire::message::Mode;
+use cantap_formats::WriteOptions;
 use cantap_signals::Decoder;
 use cantap_trace::filter::Filter;
 
@@ -23,6 +24,7 @@ use crate::monitor::profile::Profile;
 use crate::monitor::source::{Order, Origin, Plan};
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
+use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
 
@@ -64,6 +66,9 @@ pub struct Args {
     /// Record to this file from the start.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
+    /// Record over a file that is there already.
+    #[arg(long, requires = "output")]
+    force: bool,
     /// Memory for scrolling back, in MB.
     #[arg(long, value_name = "MB", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=4096))]
     history: u32,
@@ -103,6 +108,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if let Some(name) = file.and_then(Path::to_str).filter(|name| Address::is_no_port(name)) {
         return Err(wrong(format!("'{name}' is a device: write cantap monitor -d {name}")));
     }
+    refuse_recording(args)?;
     // What is wrong with profile and databases is shown, and the view opens without it.
     let mut complaints = Vec::new();
     let profile = load_profile(args.profile.as_deref(), &mut complaints);
@@ -144,6 +150,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         show(origin, app, model, receiver)?;
     }
     Ok(ExitCode::SUCCESS)
+}
+
+/// Refuses a recording that cannot be made as asked. Its name may have a condition behind it: `FILE if CONDITION`.
+fn refuse_recording(args: &Args) -> anyhow::Result<()> {
+    let Some(text) = args.output.as_deref().and_then(Path::to_str) else { return Ok(()) };
+    let path = Path::new(text.split(" if ").next().unwrap_or(text));
+    if path.extension().is_some() {
+        named(WriteOptions::default(), path)?;
+    }
+    refuse_older(path, args.force)
 }
 
 fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {

@@ -1,12 +1,13 @@
 //! A trace that a command writes.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use cantap::TraceRecord;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::{Key, ParquetError};
-use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 
 use crate::beside::Beside;
 #[cfg(feature = "parquet")]
@@ -35,6 +36,7 @@ impl TraceOutput {
         if options.format.is_none() && columns::is_parquet(path) {
             return Self::of_columns(path, FrameFiles::file(path));
         }
+        let options = &named(options.clone(), path)?;
         let is_whole = options.rotation.at.is_empty() && !grows;
         let beside = if is_whole { Beside::of(path) } else { None };
         let written = beside.as_ref().map_or(path, |beside| &beside.temporary);
@@ -91,6 +93,24 @@ impl TraceOutput {
         report(&left_out, &self.path);
         Ok(left_out)
     }
+}
+
+/// The options with the format that the file's name tells, where no other is given.
+pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOptions> {
+    if options.format.is_none() && path.as_os_str() != "-" {
+        let format = Format::of_path(path);
+        let format = format.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error));
+        options.format = Some(format.with_context(|| failed(path))?);
+    }
+    Ok(options)
+}
+
+/// Refuses to write over what a bus said once and will not say again.
+pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {
+    if path.is_file() && !force {
+        bail!("'{}' is there already; choose another name, or write over it with --force", path.display());
+    }
+    Ok(())
 }
 
 /// How a file is called in messages.

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
 #[cfg(feature = "parquet")]
 use cantap_columns::parquet::Key;
 use cantap_formats::time_range::{TimePoint, TimeRange};
@@ -17,7 +17,7 @@ use crate::completion;
 use crate::input::ReadArgs;
 use crate::interrupt;
 use crate::missing::by_kind;
-use crate::trace_output::{TraceOutput, failed};
+use crate::trace_output::{TraceOutput, named};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -164,10 +164,8 @@ impl Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
     let mut options = args.write.options(None)?;
-    if options.format.is_none() && args.output.as_os_str() != "-" && !args.is_columns()? {
-        let format = Format::of_path(&args.output);
-        let format = format.map_err(|error| std::io::Error::new(std::io::ErrorKind::InvalidInput, error));
-        options.format = Some(format.with_context(|| failed(&args.output))?);
+    if !args.is_columns()? {
+        options = named(options, &args.output)?;
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();

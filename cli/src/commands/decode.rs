@@ -28,6 +28,7 @@ use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::input::{ReadArgs, Records};
 use crate::live::LiveArgs;
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -104,7 +105,9 @@ struct Count {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     if databases.is_empty() {
-        anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
+        return Err(wrong(
+            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml)",
+        ));
     }
     let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let form = Form::of(args)?;

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use cantap::wire::message::Mode;
+use cantap_formats::WriteOptions;
 use cantap_trace::filter::Filter;
 
 use crate::address::{Address, AddressError};
@@ -24,6 +25,7 @@ use crate::monitor::profile::Profile;
 use crate::monitor::source::Origin;
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
+use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
 
@@ -65,6 +67,9 @@ pub struct Args {
     /// Record to this file from the start.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
+    /// Record over a file that is there already.
+    #[arg(long, requires = "output")]
+    force: bool,
     /// Memory for scrolling back, in MB.
     #[arg(long, value_name = "MB", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=4096))]
     history: u32,
@@ -101,6 +106,7 @@ fn size(text: &str) -> Result<(u16, u16), String> {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let (file, devices) = args.source()?;
+    refuse_recording(args)?;
     // What is wrong with profile and databases is shown, and the view opens without it; with --once it is an error.
     let mut said = Said::default();
     let profile = load_profile(args.profile.as_deref(), &mut said);
@@ -177,6 +183,16 @@ impl Args {
 #[expect(clippy::needless_pass_by_value, reason = "for map_err")]
 fn wrong_address(error: AddressError) -> anyhow::Error {
     wrong(error.to_string())
+}
+
+/// Refuses a recording that cannot be made as asked. Its name may have a condition behind it: `FILE if CONDITION`.
+fn refuse_recording(args: &Args) -> anyhow::Result<()> {
+    let Some(text) = args.output.as_deref().and_then(Path::to_str) else { return Ok(()) };
+    let path = Path::new(text.split(" if ").next().unwrap_or(text));
+    if path.extension().is_some() {
+        named(WriteOptions::default(), path)?;
+    }
+    refuse_older(path, args.force)
 }
 
 fn load_profile(path: Option<&Path>, said: &mut Said) -> Profile {

@@ -198,7 +198,7 @@ fn while_a_channel_can_send() {
             (trigger(0, filter(true, 1 << 29, 0)), Refusal::BadId),
         ],
     );
-    // Three are in mailboxes; the queue behind them is filled but for five places.
+    // Three are in mailboxes; the queue behind them is filled except for five places.
     for _ in 0..TX_QUEUE / 8 {
         bench.ask(send(CAN1, 0..8, None)).unwrap();
     }

@@ -149,7 +149,7 @@ impl Rig {
         Ok(())
     }
 
-    /// Runs for `cycles` for a host of somebody else's: returns what the device sent and keeps no books.
+    /// Runs for `cycles` for another program's host: returns what the device sent and keeps no books.
     pub fn run_unbooked(&mut self, cycles: u64) -> Result<Vec<u8>, RigError> {
         self.run_watched(cycles).map(|(bytes, _)| bytes)
     }

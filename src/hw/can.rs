@@ -354,7 +354,7 @@ enum Halt {
     None,
     /// The reset is written; the controller acknowledges it by sleeping.
     Resetting,
-    /// It sleeps no more, and is asked for initialisation mode.
+    /// It no longer sleeps, and is asked for initialisation mode.
     Entering,
 }
 

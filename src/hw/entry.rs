@@ -82,7 +82,7 @@ pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Foun
 
 /// Resets every peripheral and switches their clocks off.
 fn reset_peripherals(rcc: &pac::RCC) {
-    // SAFETY: these are bits that the registers have; what they reset is nobody's yet.
+    // SAFETY: these are bits that the registers have; what they reset is not in use yet.
     unsafe {
         rcc.ahb1rstr().write(|w| w.bits(AHB1));
         rcc.ahb2rstr().write(|w| w.bits(AHB2));
@@ -94,7 +94,7 @@ fn reset_peripherals(rcc: &pac::RCC) {
         rcc.ahb3rstr().write(|w| w.bits(0));
         rcc.apb1rstr().write(|w| w.bits(0));
         rcc.apb2rstr().write(|w| w.bits(0));
-        // The stack's memory stays on; everything else is switched on by whoever uses it.
+        // The stack's memory stays on; everything else is switched on where it is used.
         rcc.ahb1enr().write(|w| w.bits(CCM_ENABLED));
         rcc.ahb2enr().write(|w| w.bits(0));
         rcc.ahb3enr().write(|w| w.bits(0));

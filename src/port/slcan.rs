@@ -84,7 +84,7 @@ pub struct Slcan {
     flags: u8,
     /// Losses, errors and states are lines (`K1`).
     reports: bool,
-    /// A frame was refused for want of room, which is still to be reported.
+    /// A frame was refused because there was no room, which is still to be reported.
     refused_frame: bool,
     tag: u32,
     running_ticks: u64,

@@ -35,7 +35,7 @@ pub(super) fn clocks_of(clock_hz: u32, rate: f64) -> u32 {
     (f64::from(clock_hz) / rate).round() as u32
 }
 
-/// The rates between the bounds that the clock reaches exactly and that are whole kilobits, but for the common ones: what leads
+/// The rates between the bounds that the clock reaches exactly and that are whole kilobits, except for the common ones: what leads
 /// here is none of those.
 pub(super) fn round_rates(clock_hz: u32, bounds: &Bounds) -> impl Iterator<Item = u32> {
     let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS)) as u32 / 1000;

@@ -148,7 +148,7 @@ pub enum DeviceError {
 pub enum SessionOver {
     /// The device says that the computer suspended it.
     Suspended,
-    /// The device refuses requests for want of one.
+    /// The device refuses requests because there is none.
     Refused,
     /// Another program greets the device on our port.
     Greeted,

@@ -131,7 +131,7 @@ pub struct Intake {
     counters: Counters,
     /// Device time of the latest record, in ticks.
     latest_ticks: u64,
-    /// `Hello` was answered; what came before belongs to somebody else's session.
+    /// `Hello` was answered; what came before belongs to another program's session.
     in_session: bool,
 }
 
@@ -199,7 +199,7 @@ impl Intake {
                 }
             }
             Decoded::Response(response) => {
-                // A later one was asked for by somebody else, or twice by us before the first was answered.
+                // A later one was asked for by another program, or twice by us before the first was answered.
                 if let (Ok(Reply::Hello(answer)), false) = (&response.result, *in_session) {
                     // What stands before belongs to a session that is over.
                     *in_session = true;

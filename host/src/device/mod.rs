@@ -52,7 +52,7 @@ use reader::{Answer, Order, Shared};
 const BUFFER_RECORDS: usize = 1 << 20;
 /// A request is given up after this time.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
-/// How often `Hello` is tried: a device may have half a line of somebody else's in its input.
+/// How often `Hello` is tried: a device may have half a line from another program in its input.
 const HELLO_TRIES: u32 = 3;
 /// So long for each try.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);

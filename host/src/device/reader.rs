@@ -1,4 +1,4 @@
-//! The thread that reads a device's port. It waits for nobody: requests are answered through channels that
+//! The thread that reads a device's port. It never waits: requests are answered through channels that
 //! always have room, records go into a bounded buffer.
 
 use std::collections::HashMap;
@@ -223,7 +223,7 @@ impl Shared {
         })
     }
 
-    /// The reader's own question for the time; nobody waits for it, and it waits for nobody.
+    /// The reader's own question for the time; nothing waits for it, and it waits for nothing.
     fn ask_time(&self) {
         let Ok(mut output) = self.output.try_lock() else { return };
         let mut pending = lock(&self.pending);
@@ -363,7 +363,7 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
     false
 }
 
-/// Passes an answer to whoever asked. Returns the device's time and when it was asked for, if it was.
+/// Passes an answer to the caller that asked. Returns the device's time and when it was asked for, if it was.
 fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
     let mut pending = lock(&shared.pending);
     let time = match (&response.result, pending.clock) {

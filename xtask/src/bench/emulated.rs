@@ -203,7 +203,7 @@ fn stall(bound: Bound) -> Result<()> {
 
     let sent = rig.ledger.on_bus_count(channel) - until_stall;
     let lost = rig.ledger.losses(channel).total();
-    // Frames are 48 µs apart; but for the few after there is room again, those lost are the last ones.
+    // Frames are 48 µs apart; except for the few after there is room again, those lost are the last ones.
     let lost_ms = lost as f64 * 0.048;
     println!("host stall at 100 % of one channel (std0), {STALL_MS} ms, at {bound}:");
     println!(

@@ -44,7 +44,7 @@ const PACKET_GAP_NS: u64 = 60 * MS_NS;
 /// The car begins to send when its ECUs have started.
 const START_NS: u64 = 120 * MS_NS;
 const MS_NS: u64 = 1_000_000;
-/// An ECU's times are off by so much of a cycle, at most, and by no more than [`MAX_JITTER_NS`].
+/// How much of a cycle an ECU's times are off, at most, and by no more than [`MAX_JITTER_NS`].
 const JITTER_PER_MILLE: u64 = 15;
 const MAX_JITTER_NS: u64 = 900_000;
 /// Error counts (ISO 11898-1:2015, 12.1.4) and how long an ECU stays away when it is bus-off.

@@ -128,7 +128,7 @@ impl SimBus {
         matches!(self.phase, Phase::Free { .. })
     }
 
-    /// The bus's bit rate, once anybody takes part. Simulated nodes are silent while nobody listens.
+    /// The bus's bit rate, once a node takes part. Simulated nodes are silent while none listens.
     fn rate(&self, nodes: &[&mut dyn Node]) -> Option<u32> {
         let joined = nodes.iter().find_map(|node| node.bitrate_bps())?;
         Some(self.bitrate_bps.unwrap_or(joined))

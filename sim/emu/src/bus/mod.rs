@@ -183,7 +183,7 @@ impl Wire {
         }
     }
 
-    /// When [`Self::advance`] is wanted next.
+    /// When [`Self::advance`] must be called next.
     pub fn next_event(&self, can: &CanPair) -> Option<u64> {
         if let Some(stuck) = &self.stuck {
             return Some(stuck.next_error);

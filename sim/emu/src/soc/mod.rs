@@ -112,7 +112,7 @@ pub struct Board {
     crc: Crc,
     dbgmcu: Storage,
     devices: Vec<Device>,
-    /// Interrupt of the attached device that was last reached, until somebody asks.
+    /// Interrupt of the attached device that was last reached, until it is asked for.
     reached: Option<u16>,
     odd: BTreeMap<(Oddity, u32, bool), u64>,
     clock: Clock,
@@ -302,7 +302,7 @@ impl Board {
         lines
     }
 
-    /// When [`Self::advance`] is wanted next.
+    /// When [`Self::advance`] must be called next.
     pub fn next_event(&self) -> Option<u64> {
         let wires = self.wires.iter().filter_map(|wire| wire.next_event(&self.can));
         let timers = self.timers.iter().filter_map(Timer::next_event);

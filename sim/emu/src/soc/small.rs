@@ -233,7 +233,7 @@ pub struct Storage {
 }
 
 impl Storage {
-    /// `count` registers that are zero, but for the bits `ones` (register, mask) that stay set.
+    /// `count` registers that are zero, except for the bits `ones` (register, mask) that stay set.
     pub fn new(count: usize, ones: &'static [(usize, u32)]) -> Self {
         Self { registers: vec![0; count], ones }
     }

@@ -80,14 +80,14 @@ fn control(shell: &Shell, root: &Path, program: &Path, architecture: &str) -> Re
 
 /// Debian's machine-readable form. The Apache licence is on every Debian system; only its place is named.
 fn copyright(mit: &str) -> String {
-    let indented: String =
-        mit.trim().lines().map(|line| format!(" {}\n", if line.is_empty() { "." } else { line })).collect();
+    let lines = mit.trim().lines().map(|line| format!(" {}", if line.is_empty() { "." } else { line }));
+    let indented = lines.collect::<Vec<_>>().join("\n");
     format!(
-        "Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/\nUpstream-Name: cantap\n\n\
+        "Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/\nUpstream-Name: cantap\n\
+         Comment: Other people's crates in this program, and their licences, are in THIRD-PARTY.txt.\n\n\
          Files: *\nCopyright: The cantap developers\nLicense: Expat or Apache-2.0\n\n\
-         License: Expat\n{indented}\n\
-         License: Apache-2.0\n The full text is in /usr/share/common-licenses/Apache-2.0.\n\n\
-         Comment: Other people's crates in this program, and their licences, are in THIRD-PARTY.txt.\n"
+         License: Expat\n{indented}\n\n\
+         License: Apache-2.0\n The full text is in /usr/share/common-licenses/Apache-2.0.\n"
     )
 }
 

@@ -78,7 +78,8 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
         let mut rig = joined_under(bound, &[Can1]);
         saturate(&mut rig, Can2, 280);
         let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
-        let within_us = if bound == Best { 0.8 } else { 1.6 };
+        // At worst, the drain of a frame and the work for the last transmission's end may come one after the other.
+        let within_us = if bound == Best { 0.8 } else { 3.0 };
         hold_times(bound, &format!("beside 100 % at {load} %"), replayed.as_deref(), within_us);
         rig.run_for(100 * MS).unwrap();
         rig.close(Can2).unwrap();

@@ -4,6 +4,7 @@
 //! |---|---|---|
 //! | 5 | both channels' receive and transmit interrupts: the stamp, and nothing else | a late stamp is a wrong one |
 //! | 4 | draining both FIFOs, confirming, error interrupts, the transmission alarm | a FIFO of three frames waits 141 µs |
+//! | 3 | a receive pin that is measured | USB would blur it, and capture must not wait |
 //! | 2 | USB, the millisecond tick | a host can be made to wait |
 //! | – | idle | sleeps |
 //!
@@ -32,15 +33,17 @@ mod app {
     use cantap_firmware::bus::capture::Capture;
     use cantap_firmware::bus::filters::Layout;
     use cantap_firmware::bus::queue::RecordQueue;
+    use cantap_firmware::bus::transmit::TxQueue;
     use cantap_firmware::lights::Activity;
-    use cantap_firmware::port::session::Session;
-    use cantap_firmware::ports::FilterBanks;
-    use cantap_wire::Channel;
+    use cantap_firmware::port::session::{self, Session};
+    use cantap_firmware::ports::{FilterBanks, Traffic};
+    use cantap_wire::{CHANNELS, Channel};
 
     use stm32f4xx_hal::pac::Interrupt;
 
     use crate::hw::access::{Access, Controls, Tap};
     use crate::hw::can::Bells;
+    use crate::hw::edges::EdgeCatcher;
     use crate::hw::stamp::StampTimer;
     use crate::hw::tick::Tick;
     use crate::hw::usb::{Memory, UsbPort};
@@ -53,6 +56,8 @@ mod app {
         tap: Tap,
         /// To be read at any priority.
         stamp: StampTimer,
+        /// Takes down edges of the receive pin that is measured.
+        catcher: EdgeCatcher,
         /// The switches of CAN1's interrupts.
         can1_bells: Bells<0>,
         /// The switches of CAN2's interrupts.
@@ -62,9 +67,9 @@ mod app {
         /// When the interrupt stamped CAN2's last frame.
         can2_entered: AtomicU32,
         /// When the interrupt stamped CAN1's last transmission.
-        can1_sent_at: AtomicU32,
+        can1_sent_at: &'static AtomicU32,
         /// When the interrupt stamped CAN2's last transmission.
-        can2_sent_at: AtomicU32,
+        can2_sent_at: &'static AtomicU32,
         /// Only at priority 2.
         #[lock_free]
         session: Session<'static>,
@@ -82,15 +87,27 @@ mod app {
         watchdog: Watchdog,
     }
 
-    #[init(local = [records: RecordQueue = RecordQueue::new(), usb_memory: Memory = Memory::new()])]
+    // What is large is made here, in its place: a value that `init` returned would pass over the stack.
+    #[init(local = [
+        records: RecordQueue = RecordQueue::new(),
+        tx_memory: [TxQueue; CHANNELS] = [const { TxQueue::new() }; CHANNELS],
+        session_memory: session::Memory = session::Memory::new(),
+        usb_memory: Memory = Memory::new(),
+        sent_at: [AtomicU32; CHANNELS] = [const { AtomicU32::new(0) }; CHANNELS],
+    ])]
     fn init(cx: init::Context) -> (Shared, Local) {
-        let hardware = hw::start(cx.device, cx.local.usb_memory);
+        let init::LocalResources { records, tx_memory, session_memory, usb_memory, sent_at, .. } = cx.local;
+        let sent_at: &'static [AtomicU32; CHANNELS] = sent_at;
+        let [can1_sent_at, can2_sent_at] = sent_at;
+        let hardware = hw::start(cx.device, usb_memory, sent_at);
         let Hardware {
             can,
             alarm,
             sof,
             tick,
             crc,
+            meter,
+            catcher,
             usb,
             mut chip,
             watchdog,
@@ -102,20 +119,21 @@ mod app {
         let stamp = alarm.timer();
         let mut filters = can.filters;
         filters.write(&Layout::open());
-        let (producer, consumer) = cx.local.records.split();
+        let (producer, consumer) = records.split();
         (
             Shared {
-                tap: Tap { capture: Capture::new(producer), traffic: can.traffic, alarm },
+                tap: Tap { capture: Capture::new(producer, tx_memory), traffic: can.traffic, alarm },
                 stamp,
+                catcher,
                 can1_bells,
                 can2_bells,
                 can1_entered: AtomicU32::new(0),
                 can2_entered: AtomicU32::new(0),
-                can1_sent_at: AtomicU32::new(0),
-                can2_sent_at: AtomicU32::new(0),
-                session: Session::new(consumer, identity),
+                can1_sent_at,
+                can2_sent_at,
+                session: Session::new(consumer, identity, session_memory),
                 usb,
-                controls: Controls { can: can.control, filters, chip, stamp, sof, crc },
+                controls: Controls { can: can.control, filters, chip, stamp, sof, crc, meter },
             },
             Local { tick, watchdog },
         )
@@ -185,24 +203,23 @@ mod app {
     /// Fills CAN1's mailboxes again and confirms what was sent. USART2 is not used, and its interrupt raises this task.
     ///
     /// Priority 4, because it writes records. Back-to-back transmission goes on if this starts before the other two
-    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause.
-    #[task(binds = USART2, priority = 4, shared = [tap, &can1_bells, &can1_sent_at])]
+    /// mailboxes are empty: 94 µs at 1 Mbit/s. Later, the bus has a pause. A transmission that ends before this has emptied the mailboxes
+    /// is stamped when it is found.
+    #[task(binds = USART2, priority = 4, shared = [tap])]
     fn can1_sent(mut cx: can1_sent::Context) {
-        let entered = cx.shared.can1_sent_at.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            let entered = traffic[0].stamped();
             capture.on_transmit(Channel::Can1, traffic, alarm, entered);
         });
-        cx.shared.can1_bells.open_transmit();
     }
 
     /// As [`can1_sent`], for CAN2, with USART3.
-    #[task(binds = USART3, priority = 4, shared = [tap, &can2_bells, &can2_sent_at])]
+    #[task(binds = USART3, priority = 4, shared = [tap])]
     fn can2_sent(mut cx: can2_sent::Context) {
-        let entered = cx.shared.can2_sent_at.load(Ordering::Relaxed);
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
+            let entered = traffic[1].stamped();
             capture.on_transmit(Channel::Can2, traffic, alarm, entered);
         });
-        cx.shared.can2_bells.open_transmit();
     }
 
     /// Records CAN1's errors and changes of state.
@@ -235,6 +252,28 @@ mod app {
             alarm.acknowledge();
             capture.on_alarm(traffic, alarm);
         });
+    }
+
+    /// Takes down the edges of a receive pin that is measured: CAN1's or CAN2's, as the board has them. They never come while its
+    /// controller is on the bus.
+    ///
+    /// Priority 3: above USB, which may wait for the 6 ms that it lasts at most, and below everything that captures or sends. An edge of
+    /// 1 Mbit/s is over after a microsecond: what comes too late is marked, and a frame of it lost to the measurement.
+    #[task(binds = EXTI15_10, priority = 3, shared = [&catcher])]
+    fn exti15_10(cx: exti15_10::Context) {
+        cx.shared.catcher.catch();
+    }
+
+    /// As [`exti15_10`], for a pin of the lines 5 to 9.
+    #[task(binds = EXTI9_5, priority = 3, shared = [&catcher])]
+    fn exti9_5(cx: exti9_5::Context) {
+        cx.shared.catcher.catch();
+    }
+
+    /// As [`exti15_10`], for a pin of line 0.
+    #[task(binds = EXTI0, priority = 3, shared = [&catcher])]
+    fn exti0(cx: exti0::Context) {
+        cx.shared.catcher.catch();
     }
 
     /// Talks to the host.

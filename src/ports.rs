@@ -69,6 +69,13 @@ pub trait Traffic {
     /// Requests transmission of the frame that was last prepared, which is in this mailbox. Takes next to no time; frames
     /// leave in the order of these calls.
     fn request(&mut self, mailbox: u8);
+    /// When the transmit interrupt stamped the first of the transmissions that have finished and were not taken; `None` if there are
+    /// none, or where the interrupt hands its stamp over itself.
+    fn stamped(&self) -> Option<u32> {
+        None
+    }
+    /// Nothing that has finished is left: the interrupt may stamp the next.
+    fn await_finished(&mut self) {}
     /// Takes one finished transmission: its mailbox and how it ended.
     fn take_finished(&mut self) -> Option<(u8, Outcome)>;
     /// Asks for every mailbox to be given up. Those that can still be are reported as
@@ -100,9 +107,35 @@ pub trait Control {
 /// The acceptance filters of all controllers.
 pub trait FilterBanks {
     /// Writes what of the banks differs from the layout, as they are now. Reception is interrupted, so no channel may be open unless
-    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ.
-    fn write(&mut self, layout: &Layout);
+    /// the layout's shape (split, modes, scales) is what it was and only closed channels' banks differ. Returns whether anything
+    /// differed.
+    fn write(&mut self, layout: &Layout) -> bool;
 }
+
+/// A change of a receive pin's level.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PinEdge {
+    /// The stamp timer when it came.
+    pub at: u32,
+    /// The level behind it: dominant, or recessive.
+    pub dominant: bool,
+    /// The meter was blind for a moment just before: edges may be missing, and this one may have been earlier.
+    pub unsure: bool,
+}
+
+/// Measures when a channel's receive pin changes, whatever the bit rate. It only listens, and never at the cost of capture: what it misses
+/// is marked.
+pub trait EdgeMeter {
+    /// Forgets what was measured, and watches this channel's pin from now on; `None` for none.
+    fn watch(&mut self, channel: Option<cantap_wire::Channel>);
+    /// Takes the oldest edge. A meter keeps [`EDGES_KEPT`]; when they are full, it is blind until all of them are taken.
+    fn next(&mut self) -> Option<PinEdge>;
+    /// The level of the pin that is watched; false if none is.
+    fn is_dominant(&self) -> bool;
+}
+
+/// Edges that a meter keeps: those of two of the longest frames.
+pub const EDGES_KEPT: usize = 256;
 
 /// The chip itself.
 pub trait Chip {

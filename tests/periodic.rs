@@ -85,7 +85,7 @@ fn full_tables_that_cannot_leave_cost_no_alarms_and_few_records() {
     let counted = counters(&mut bench).1 - before;
     let all = passed * PERIODIC_SLOTS as u32;
     assert!(counted.abs_diff(all) <= 2 * PERIODIC_SLOTS as u32, "{counted} of {all}");
-    // And reported: but for what has passed since each one's last record.
+    // And reported, except for what has passed since each one's last record.
     let told: u32 = told(&bench).0.iter().sum();
     assert!(told <= counted && told >= counted / 2, "{told} of {counted}");
 }
@@ -172,7 +172,7 @@ fn what_passed_is_told_also_after_the_entry_is_gone() {
     for slot in 0..3 {
         set(&mut bench, CAN1, slot, Some(entry(slot, TICKS_PER_MS, 1)));
     }
-    // Each waits behind the queue's frames, and ten of its periods pass; but for what earlier records reported.
+    // Each waits behind the queue's frames, and ten of its periods pass, except for what earlier records reported.
     live(&mut bench, 10_500);
     set(&mut bench, CAN1, 0, None);
     set(&mut bench, CAN1, 1, Some(entry(1, 1000 * TICKS_PER_MS, 0)));

@@ -198,7 +198,7 @@ fn while_a_channel_can_send() {
             (trigger(0, filter(true, 1 << 29, 0)), Refusal::BadId),
         ],
     );
-    // Three are in mailboxes; the queue behind them is filled but for five places.
+    // Three are in mailboxes; the queue behind them is filled except for five places.
     for _ in 0..TX_QUEUE / 8 {
         bench.ask(send(CAN1, 0..8, None)).unwrap();
     }
@@ -276,9 +276,10 @@ fn the_longest_answer_is_readable() {
 /// A frame that comes between bus-off and the end of giving the queue up is given up like the others, not forgotten.
 #[test]
 fn a_frame_that_comes_while_the_queue_is_given_up_is_told_of() {
-    use cantap_firmware::bus::transmit::Transmitter;
+    use cantap_firmware::bus::transmit::{Transmitter, TxQueue};
     use cantap_wire::record::TransmitFailure;
-    let mut transmitter = Transmitter::new(CAN1);
+    let mut queue = TxQueue::new();
+    let mut transmitter = Transmitter::new(CAN1, &mut queue);
     let mut traffic = fakes::FakeTraffic::default();
     let frame = |tag| TxFrame { tag, frame: numbered(1), at_ticks: None };
     assert!(transmitter.enqueue(&frame(1)));

@@ -2,9 +2,11 @@
 
 mod fakes;
 
+use cantap_firmware::bus::filters::Layout;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::{QUEUE_BYTES, TICK_HZ};
 use cantap_wire::message::{EndReason, Filter, FrameKind, Mode, TxFrame};
+use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Command, Event, PROTOCOL_VERSION, Refusal, Reply, Request, Response};
 use fakes::{Bench, SMALL_QUEUE, config, encode, numbered};
 
@@ -117,9 +119,31 @@ fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
     bench.board.control[0].halts_needed = 3;
     bench.ask(Command::Close { channel: CAN1 }).unwrap();
     assert_eq!(bench.board.control[0].halts, 3);
-    assert_eq!(bench.board.filters.written.len(), written.len() + 1);
-    assert_eq!(bench.board.filters.written.last(), written.last());
+    // Right behind the reset, and when it has left.
+    assert_eq!(
+        bench.board.filters.written[written.len()..],
+        [(); 2].map(|()| written.last().unwrap().clone())
+    );
     assert!(bench.board.traffic[0].aborts > 0);
+}
+
+/// What came while there were no filters is counted by nobody, so that there was something must be said.
+#[test]
+fn a_channel_that_was_deaf_behind_the_others_reset_says_so() {
+    for cleared in [false, true] {
+        let queue = RecordQueue::<SMALL_QUEUE>::new();
+        let mut bench = Bench::opened(&queue, Mode::Normal);
+        bench.board.filters.written.push(Layout::open());
+        bench.board.filters.cleared = cleared;
+        bench.board.control[0].stuck = true;
+        bench.ask(Command::Close { channel: CAN1 }).unwrap();
+        bench.millisecond();
+        bench.millisecond();
+        let losses: Vec<Event> =
+            bench.events().into_iter().filter(|event| matches!(event, Event::Lost { .. })).collect();
+        let deaf = Event::Lost { channel: CAN2, stage: LossStage::Controller, count: 0, at_least: true };
+        assert_eq!(losses, if cleared { vec![deaf] } else { Vec::new() });
+    }
 }
 
 /// A controller without a clock: the host gets an answer, and can try again.

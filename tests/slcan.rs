@@ -49,7 +49,7 @@ fn a_channel_is_set_up_opened_and_closed() {
             ("", "\r"),
             ("C", "\r"),
             ("O", "\x07"),
-            ("S9", "\x07"),
+            ("S:", "\x07"),
             ("S", "\x07"),
             ("S6", "\r"),
             ("F", "\x07"),
@@ -76,11 +76,39 @@ fn a_channel_is_set_up_opened_and_closed() {
 fn each_s_digit_is_its_bit_rate() {
     let queue = RecordQueue::<SMALL_QUEUE>::new();
     let mut bench = Bench::new(&queue);
-    for (digit, rate) in [10, 20, 50, 100, 125, 250, 500, 800, 1000].iter().enumerate() {
+    let rates = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000, 83_333];
+    for (digit, rate) in rates.into_iter().enumerate() {
         converse(&mut bench, &[(&format!("S{digit}"), "\r"), ("O", "\r"), ("C", "\r")]);
         let timing = bench.board.control[0].started[digit].timing;
-        assert_eq!(timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ), rate * 1000);
+        assert_eq!(timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ), rate);
     }
+}
+
+/// Lawicel's `S7` is 800 kbit/s, python-can's 750: it alone sends an empty line behind it.
+#[test]
+fn s7_with_an_empty_line_behind_it_is_what_python_can_means() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("", "\r"), ("S7", "\r"), ("", "\r"), ("O", "\r"), ("C", "\r")]);
+    converse(&mut bench, &[("S7", "\r"), ("Z0", "\r"), ("", "\r"), ("O", "\r"), ("C", "\r")]);
+    converse(&mut bench, &[("S7", "\r"), ("S6", "\r"), ("", "\r"), ("O", "\r"), ("C", "\r")]);
+    let started = bench.board.control[0].started.iter();
+    let rates: Vec<u32> =
+        started.map(|config| config.timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ)).collect();
+    assert_eq!(rates, [750_000, 800_000, 500_000]);
+}
+
+/// A host that does not look at the answers would hear nothing but errors, or disturb the bus.
+#[test]
+fn after_a_rate_that_was_refused_nothing_is_opened_at_the_one_before() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S6", "\r"), ("O", "\r"), ("C", "\r"), ("Q1", "\r")]);
+    for refused in ["S:", "S", "S66", "s009C", "s00", "s00GG"] {
+        converse(&mut bench, &[(refused, "\x07"), ("O", "\x07"), ("L", "\x07")]);
+    }
+    converse(&mut bench, &[("S5", "\r"), ("O", "\r")]);
+    assert_eq!(bench.board.control[0].started.len(), 2);
 }
 
 /// `s` takes an SJA1000's BTR0 and BTR1 at 16 MHz: 001C is 500 kbit/s with its sample point at 87.5 %.

@@ -76,7 +76,7 @@ fn what_ended_while_the_task_was_kept_waiting_is_not_stamped_early() {
     bench.pass(50 * TICKS_PER_US);
     bench.board.traffic[0].send_one().unwrap();
     let second = bench.board.clock.now.get();
-    bench.board.capture.on_transmit(CAN1, &mut bench.board.traffic, &bench.board.clock, stamp);
+    bench.board.capture.on_transmit(CAN1, &mut bench.board.traffic, &bench.board.clock, Some(stamp));
     flush(&mut bench);
     let sent = |(_, record): &&(u64, Record)| matches!(record, Record::Event(Event::Transmitted { .. }));
     let times: Vec<u64> = bench.records.iter().filter(sent).map(|(at, _)| *at).collect();
@@ -395,7 +395,7 @@ fn manual_recovery_gives_the_queue_up_and_waits_for_the_command() {
 }
 
 /// A confirmation is never lost: while the host reads nothing, transmission stops before it.
-/// One channel's periodic frames cannot be confirmed for want of room, and wait; the other channel's frame is due meanwhile. An
+/// One channel's periodic frames cannot be confirmed because there was no room, and wait; the other channel's frame is due meanwhile. An
 /// alarm that came again and again would keep USB from making room.
 #[test]
 fn what_waits_for_room_on_one_channel_raises_no_storm_of_alarms_for_the_other() {

@@ -1,16 +1,18 @@
-//! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`.
+//! Where a device is: `/dev/ttyACM0`, `COM5`, `virtual:load=50`, `emu:firmware.elf`, or at a server: `unix:`, `tcp://HOST`.
 
 use std::borrow::Borrow;
 use std::fmt;
 use std::ops::Deref;
+use std::path::Path;
 use std::str::FromStr;
 
 use anyhow::Context;
-#[cfg(feature = "emu")]
 use cantap::device::Link;
 use cantap::wire::CHANNELS;
 use cantap::{Channel, Device};
 use cantap_virtual::Options;
+
+use crate::server::Server;
 
 /// The virtual device's buses have the bit rate of whoever opens a channel: this one, if nobody says another.
 const VIRTUAL_BITRATE_BPS: u32 = 500_000;
@@ -28,6 +30,8 @@ pub struct Address {
 enum Place {
     /// The serial port that the address is the name of.
     Serial,
+    /// A server that shares a board.
+    Server(Server),
     /// The virtual device.
     Virtual(Box<Options>),
     /// A firmware ELF on the emulated board.
@@ -88,7 +92,9 @@ impl FromStr for Address {
             }
             #[cfg(not(feature = "emu"))]
             Some(("emu", _)) => return Err(AddressError::NotBuilt(text.to_owned())),
-            Some(("tcp", _)) => return Err(bad("devices over TCP are not supported; use a serial port")),
+            _ if Server::is_meant(text) => {
+                Place::Server(Server::parse(text).map_err(|reason| option(&reason))?)
+            }
             _ => Place::Serial,
         };
         Ok(Self { text: text.strip_suffix("virtual:").map_or(text, |_| "virtual").to_owned(), place })
@@ -111,6 +117,21 @@ impl Address {
         text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")
     }
 
+    /// Whether what stands where a trace or a device can stand is meant for a device: one that needs no port, or a serial port. What
+    /// is there as a file is one.
+    pub fn is_meant_by(path: &Path) -> bool {
+        if let Ok(there) = path.metadata() {
+            return is_port(&there);
+        }
+        let text = path.to_str().unwrap_or_default();
+        let is_com = |text: &str| {
+            let digits = text.strip_prefix("COM");
+            digits
+                .is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
+        };
+        Self::is_no_port(text) || text.starts_with("/dev/") || is_com(text)
+    }
+
     /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
     pub fn is_car(&self) -> bool {
         matches!(&self.place, Place::Virtual(options) if options.car)
@@ -118,43 +139,62 @@ impl Address {
 
     /// Whether a device there can go and come back: one that lives in this process cannot.
     pub const fn may_come_back(&self) -> bool {
-        matches!(self.place, Place::Serial)
+        matches!(self.place, Place::Serial | Place::Server(_))
     }
 
     /// Begins a session with the board of a serial number, wherever it is plugged in now, as far as the system tells; else with
     /// whatever is at the address.
     pub fn open_again(&self, serial_number: Option<&str>) -> anyhow::Result<OpenDevice> {
-        match serial_number.filter(|_| self.may_come_back()).and_then(cantap::device::port_of) {
-            Some(port) => Ok(OpenDevice { device: Device::open(&port)?, bitrates: [None; CHANNELS] }),
-            None => self.open(),
-        }
+        let device = Device::over(self.link(serial_number)?, &self.text)?;
+        Ok(OpenDevice { device, bitrates: self.bitrates_of_buses() })
     }
 
     /// Begins a session with the device.
     pub fn open(&self) -> anyhow::Result<OpenDevice> {
-        let device = match &self.place {
-            Place::Serial => Device::open(&self.text)?,
-            Place::Virtual(options) => {
-                let connection = cantap_virtual::start((**options).clone())
-                    .context("the system refused a thread; close other programs and try again")?;
-                Device::over(connection.into_link(), &self.text)?
+        self.open_again(None)
+    }
+
+    /// The way to the device; to the board of a serial number wherever it is now, as far as the system tells.
+    pub fn link(&self, serial_number: Option<&str>) -> anyhow::Result<Link> {
+        Ok(match &self.place {
+            Place::Serial => {
+                let port = serial_number.and_then(cantap::device::port_of);
+                cantap::device::open_port(port.as_deref().unwrap_or(&self.text))?
             }
+            Place::Server(server) => server.link()?,
+            Place::Virtual(options) => cantap_virtual::start((**options).clone())
+                .context("the system refused a thread; close other programs and try again")?
+                .into_link(),
             #[cfg(feature = "emu")]
             Place::Emulated(board) => {
                 let port = (**board)
                     .clone()
                     .open()
                     .with_context(|| format!("the emulated board at '{self}' does not start"))?;
-                Device::over(Link::new(port.reader, port.writer).keeping(port.device), &self.text)?
+                Link::new(port.reader, port.writer).keeping(port.device)
             }
-        };
-        let bitrates = match &self.place {
+        })
+    }
+
+    /// The bit rates of the buses in bit/s, where they are known without listening.
+    pub fn bitrates_of_buses(&self) -> [Option<u32>; CHANNELS] {
+        match &self.place {
             Place::Virtual(options) => Channel::ALL
                 .map(|channel| options.bitrate_of_bus(channel.index()).or(Some(VIRTUAL_BITRATE_BPS))),
             _ => [None; CHANNELS],
-        };
-        Ok(OpenDevice { device, bitrates })
+        }
     }
+}
+
+#[cfg(unix)]
+fn is_port(there: &std::fs::Metadata) -> bool {
+    use std::os::unix::fs::FileTypeExt;
+    there.file_type().is_char_device()
+}
+
+#[cfg(not(unix))]
+fn is_port(_: &std::fs::Metadata) -> bool {
+    false
 }
 
 impl PartialEq for Address {
@@ -203,13 +243,37 @@ mod tests {
 
     #[test]
     fn addresses_round_trip_and_bad_ones_say_what_would_be_right() {
-        for text in ["/dev/ttyACM0", "COM5", "virtual", "virtual:load=50"] {
+        for text in
+            ["/dev/ttyACM0", "COM5", "virtual", "virtual:load=50", "tcp://[::1]:5", "ssh://a@b/virtual:car"]
+        {
             assert_eq!(text.parse::<Address>().unwrap().to_string(), text);
         }
         assert_eq!("virtual:".parse::<Address>().unwrap().to_string(), "virtual");
-        for text in ["", "emu", "emu:", "tcp:1.2.3.4", "virtual:speed=9"] {
+        for text in ["", "emu", "emu:", "tcp:1.2.3.4", "virtual:speed=9", "tcp://", "ssh://-oX"] {
             assert!(text.parse::<Address>().is_err(), "{text}");
         }
+    }
+
+    #[test]
+    fn what_stands_where_a_trace_can_stand_may_be_a_device() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("virtual");
+        std::fs::write(&file, "").unwrap();
+        assert!(!Address::is_meant_by(&file));
+        for (text, is_device) in [
+            ("virtual", true),
+            ("virtual:car", true),
+            ("emu:a.elf", true),
+            ("COM5", true),
+            ("/dev/ttyACM17", true),
+            ("drive.log", false),
+            ("COMmon.log", false),
+            ("-", false),
+        ] {
+            assert_eq!(Address::is_meant_by(Path::new(text)), is_device, "{text}");
+        }
+        #[cfg(unix)]
+        assert!(Address::is_meant_by(Path::new("/dev/null")));
     }
 
     #[cfg(feature = "emu")]

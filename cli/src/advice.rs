@@ -53,6 +53,8 @@ fn of_device(error: &DeviceError) -> Option<String> {
             Refusal::BadTiming => "; see `cantap timing`",
             Refusal::BadSlot => "; `cantap info` shows how many there are",
             Refusal::ListenOnly => "; open it in normal mode (--mode normal) to send",
+            Refusal::NotGranted { needs } => return Some(format!("; start the server with --allow {needs}")),
+            Refusal::OtherSettings => " (without -b, the server's bit rate is taken)",
             _ => return None,
         },
         _ => return None,

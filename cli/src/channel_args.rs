@@ -131,11 +131,15 @@ impl ChannelArgs {
 
     /// Brings channels back from bus-off while the command runs, if the user says so.
     pub fn rescue(&self) -> Rescue {
-        let recovery = match self.recovery {
+        Rescue::new(self.recovery())
+    }
+
+    /// What brings channels back from bus-off, if the user says so, for whoever says it in their own way.
+    pub fn recovery(&self) -> Option<Recovery> {
+        match self.recovery {
             Some(RecoveryArg::After(time)) => Some(Recovery::new(time)),
             _ => None,
-        };
-        Rescue::new(recovery)
+        }
     }
 
     /// Opens channels, with `mode` unless the user says otherwise, and returns how. Whatever is impossible is found before

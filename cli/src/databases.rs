@@ -1,6 +1,6 @@
 //! The signal databases that a command uses.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
@@ -65,11 +65,6 @@ impl DatabaseArgs {
         self.databases.is_empty() && !self.car
     }
 
-    /// Whether it is the virtual vehicle's own.
-    pub const fn is_of_car(&self) -> bool {
-        self.car
-    }
-
     /// The virtual vehicle's own, if it is to be used.
     fn own(&self) -> Result<Option<Source>, DatabaseError> {
         let database = self.car.then(cantap_virtual::car::database).transpose()?;
@@ -92,45 +87,24 @@ impl DatabaseArgs {
             }
             sources.push(Source { channel: *channel, database });
         }
-        let decoder = self.decoder(sources);
+        let decoder = Databases { sources, j1939: self.j1939 }.decoder();
         if !quiet {
             overrides(&decoder).for_each(|text| eprintln!("cantap: {text}"));
         }
         Ok(decoder)
     }
 
-    fn decoder(&self, sources: Vec<Source>) -> Decoder {
-        let mut decoder = Decoder::new(sources);
-        if self.j1939 {
-            decoder.assume_j1939();
+    /// These to begin with, for programs that go on without one, and can take further ones.
+    pub fn to_begin_with(&self, said: &mut Said) -> Databases {
+        let sources = self.own().ok().flatten().into_iter().collect();
+        let mut databases = Databases { sources, j1939: self.j1939 };
+        if self.car {
+            said.remarks.push(CAR.to_owned());
         }
-        decoder
-    }
-
-    /// Loads what can be loaded, and `further` databases; what is wrong goes to `complaints`. For programs that
-    /// go on without a database.
-    pub fn load_what_can_be(&self, further: &[String], complaints: &mut Vec<String>) -> Decoder {
-        let mut paths = self.databases.clone();
-        for text in further {
-            match text.parse() {
-                Ok(path) => paths.push(path),
-                Err(reason) => complaints.push(format!("database {text}: {reason}")),
-            }
+        for path in &self.databases {
+            databases.add_path(path, said);
         }
-        let mut sources: Vec<_> = self.own().ok().flatten().into_iter().collect();
-        for DatabasePath { channel, path } in paths {
-            match cantap_signals::load(&path) {
-                Ok(database) => {
-                    let faults = database.warnings.iter();
-                    complaints.extend(faults.map(|fault| format!("{}: {fault}", database.file)));
-                    sources.push(Source { channel, database });
-                }
-                Err(error) => complaints.push(error.to_string()),
-            }
-        }
-        let decoder = self.decoder(sources);
-        complaints.extend(overrides(&decoder));
-        decoder
+        databases
     }
 
     /// As [`Self::load`], for commands that are useless without a database.
@@ -138,6 +112,74 @@ impl DatabaseArgs {
         let mut decoder = self.load(strict, quiet)?;
         decoder.select(&Selection::new(patterns)?).context("--signal")?;
         Ok(decoder)
+    }
+}
+
+/// What there is to be said about what was loaded.
+#[derive(Clone, Debug, Default)]
+pub struct Said {
+    /// What was asked for and is not there.
+    pub faults: Vec<String>,
+    /// What else is worth knowing.
+    pub remarks: Vec<String>,
+}
+
+/// Databases that become more.
+#[derive(Clone, Debug, Default)]
+pub struct Databases {
+    sources: Vec<Source>,
+    j1939: bool,
+}
+
+impl Databases {
+    /// Adds one, as typed after `--db`; a path that is not absolute begins in `folder`.
+    pub fn add(&mut self, text: &str, folder: &Path, said: &mut Said) {
+        match text.parse::<DatabasePath>() {
+            Ok(DatabasePath { channel, path }) => {
+                self.add_path(&DatabasePath { channel, path: folder.join(path) }, said);
+            }
+            Err(reason) => said.faults.push(format!("database {text}: {reason}")),
+        }
+    }
+
+    fn add_path(&mut self, DatabasePath { channel, path }: &DatabasePath, said: &mut Said) {
+        match cantap_signals::load(path) {
+            Ok(database) => {
+                let faults = database.warnings.iter();
+                said.remarks.extend(faults.map(|fault| format!("{}: {fault}", database.file)));
+                self.sources.push(Source { channel: *channel, database });
+            }
+            Err(error) => said.faults.push(error.to_string()),
+        }
+    }
+
+    /// Adds the virtual vehicle's own, for all channels.
+    pub fn add_car(&mut self, said: &mut Said) {
+        if let Ok(database) = cantap_virtual::car::database() {
+            self.sources.push(Source { channel: None, database });
+            said.remarks.push(CAR.to_owned());
+        }
+    }
+
+    /// Whether there are none.
+    pub fn is_empty(&self) -> bool {
+        self.sources.is_empty()
+    }
+
+    /// What decodes with them.
+    pub fn decoder(&self) -> Decoder {
+        let mut decoder = Decoder::new(self.sources.clone());
+        if self.j1939 {
+            decoder.assume_j1939();
+        }
+        decoder
+    }
+
+    /// As [`Self::decoder`], saying which messages replace others.
+    pub fn decoder_saying(&self, said: &mut Said) -> Decoder {
+        let decoder = self.decoder();
+        said.remarks.extend(overrides(&decoder));
+        decoder
     }
 }
 

@@ -16,7 +16,7 @@ use crate::missing::Missing;
 #[derive(clap::Args)]
 pub struct ReadArgs {
     /// The trace's format, where neither its content nor its name tell, or tell the wrong one.
-    #[arg(long = "from", alias = "format", value_name = "FORMAT", add = completion::formats())]
+    #[arg(long = "from", value_name = "FORMAT", add = completion::formats())]
     pub format: Option<Format>,
     /// Wait for more at the end of the file, until Ctrl-C.
     #[arg(long)]

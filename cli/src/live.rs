@@ -82,7 +82,7 @@ impl LiveArgs {
             return Ok(None);
         }
         let boards = Boards::new(&self.device, &self.channel)
-            .map_err(|error| error.context("without a trace to read, a device is listened to"))?;
+            .map_err(|error| unasked(error, &self.device, "without a trace to read"))?;
         LiveRecords::listen(&boards, &self.bitrates, self.time).map(Some)
     }
 }
@@ -253,6 +253,11 @@ impl LiveRecords {
             stderr::warn(&self.errors_only(number));
         }
     }
+}
+
+/// An error about a device that nobody named: it says why one is looked for.
+pub fn unasked(error: anyhow::Error, given: &[Address], without: &str) -> anyhow::Error {
+    if given.is_empty() { error.context(format!("{without}, a device is listened to")) } else { error }
 }
 
 /// What there is to say of a device that is there again, with its name if there are several.

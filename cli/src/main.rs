@@ -28,6 +28,8 @@ mod boards;
 mod channel_args;
 mod channel_bitrate;
 mod clock;
+#[cfg(feature = "parquet")]
+mod columns;
 mod commands;
 mod completion;
 mod databases;
@@ -43,6 +45,7 @@ mod monitor;
 mod progress;
 mod rescue;
 mod sending;
+mod server;
 mod shells;
 mod stderr;
 mod timing_args;

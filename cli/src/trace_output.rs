@@ -1,50 +1,116 @@
 //! A trace that a command writes.
 
+use std::io;
 use std::path::{Path, PathBuf};
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use cantap::TraceRecord;
-use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+#[cfg(feature = "parquet")]
+use cantap_columns::parquet::{Key, ParquetError};
+use cantap_formats::{Format, LeftOut, TraceWriter, WriteOptions, create_writer};
 
 use crate::beside::Beside;
+#[cfg(feature = "parquet")]
+use crate::columns::{self, FrameFiles};
 
 /// A trace being written. An older file of its name stays as it is until this one is whole.
 pub struct TraceOutput {
     path: PathBuf,
-    writer: Box<dyn TraceWriter>,
-    beside: Option<Beside>,
+    sink: Sink,
+}
+
+enum Sink {
+    Trace {
+        writer: Box<dyn TraceWriter>,
+        beside: Option<Beside>,
+    },
+    #[cfg(feature = "parquet")]
+    Columns(Box<FrameFiles>),
 }
 
 impl TraceOutput {
     /// Begins the file. What `grows`, as what comes from a bus, is for others to read meanwhile: it is written in place, as are
     /// files that follow one another.
     pub fn create(path: &Path, options: &WriteOptions, grows: bool) -> anyhow::Result<Self> {
+        #[cfg(feature = "parquet")]
+        if options.format.is_none() && columns::is_parquet(path) {
+            return Self::of_columns(path, FrameFiles::file(path));
+        }
+        let options = &named(options.clone(), path)?;
         let is_whole = options.rotation.at.is_empty() && !grows;
         let beside = if is_whole { Beside::of(path) } else { None };
         let written = beside.as_ref().map_or(path, |beside| &beside.temporary);
         let writer = create_writer(written, options).with_context(|| failed(path))?;
-        Ok(Self { path: path.to_owned(), writer, beside })
+        Ok(Self { path: path.to_owned(), sink: Sink::Trace { writer, beside } })
+    }
+
+    /// Begins a folder of Parquet files, each called `name`, in folders by these keys.
+    #[cfg(feature = "parquet")]
+    pub fn dataset(path: &Path, keys: Vec<Key>, name: &str) -> Self {
+        Self { path: path.to_owned(), sink: Sink::Columns(Box::new(FrameFiles::dataset(path, keys, name))) }
+    }
+
+    #[cfg(feature = "parquet")]
+    fn of_columns(path: &Path, files: Result<FrameFiles, ParquetError>) -> anyhow::Result<Self> {
+        let files = files.with_context(|| failed(path))?;
+        Ok(Self { path: path.to_owned(), sink: Sink::Columns(Box::new(files)) })
     }
 
     /// Adds a record.
     pub fn write(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
-        self.writer.write(record).with_context(|| failed(&self.path))
+        match &mut self.sink {
+            Sink::Trace { writer, .. } => writer.write(record).with_context(|| failed(&self.path)),
+            #[cfg(feature = "parquet")]
+            Sink::Columns(files) => files.write(record).with_context(|| failed(&self.path)),
+        }
     }
 
-    /// Writes what waits in memory.
+    /// Writes what waits in memory, where a reader could take it before the end.
     pub fn flush(&mut self) -> anyhow::Result<()> {
-        self.writer.flush().with_context(|| failed(&self.path))
+        match &mut self.sink {
+            Sink::Trace { writer, .. } => writer.flush().with_context(|| failed(&self.path)),
+            #[cfg(feature = "parquet")]
+            Sink::Columns(_) => Ok(()),
+        }
     }
 
     /// Ends the file and puts it in its place. Says what it could not carry, and returns it.
     pub fn finish(self) -> anyhow::Result<LeftOut> {
-        let left_out = self.writer.finish().with_context(|| failed(&self.path))?;
-        if let Some(beside) = self.beside {
-            beside.put_in_place().with_context(|| failed(&self.path))?;
-        }
+        let left_out = match self.sink {
+            Sink::Trace { writer, beside } => {
+                let left_out = writer.finish().with_context(|| failed(&self.path))?;
+                if let Some(beside) = beside {
+                    beside.put_in_place().with_context(|| failed(&self.path))?;
+                }
+                left_out
+            }
+            #[cfg(feature = "parquet")]
+            Sink::Columns(files) => {
+                files.finish().with_context(|| failed(&self.path))?;
+                LeftOut::default()
+            }
+        };
         report(&left_out, &self.path);
         Ok(left_out)
     }
+}
+
+/// The options with the format that the file's name tells, where no other is given.
+pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOptions> {
+    if options.format.is_none() && path.as_os_str() != "-" {
+        let format = Format::of_path(path);
+        let format = format.map_err(|error| io::Error::new(io::ErrorKind::InvalidInput, error));
+        options.format = Some(format.with_context(|| failed(path))?);
+    }
+    Ok(options)
+}
+
+/// Refuses to write over what a bus said once and will not say again.
+pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {
+    if path.is_file() && !force {
+        bail!("'{}' is there already; choose another name, or write over it with --force", path.display());
+    }
+    Ok(())
 }
 
 /// How a file is called in messages.

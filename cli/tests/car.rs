@@ -60,11 +60,9 @@ fn the_live_view_shows_signals_by_itself_and_says_whose_they_are() {
 
 #[test]
 fn a_device_in_the_place_of_a_trace_is_told_apart() {
-    let output =
-        Command::new(env!("CARGO_BIN_EXE_cantap")).args(["monitor", "virtual:car"]).output().unwrap();
-    assert_eq!(output.status.code(), Some(2));
-    let said = String::from_utf8(output.stderr).unwrap();
-    assert!(said.contains("write cantap monitor -d virtual:car"), "{said}");
+    let (screen, said) = cantap(&["monitor", "virtual:car", "--once", "-t", "1s", "--size", "120x50"]);
+    assert!(screen.contains("virtual:car listen-only: running") && screen.contains("500k"), "{screen}");
+    assert!(said.contains("cantap virtual car --dbc"), "{said}");
 }
 
 #[test]

@@ -91,7 +91,6 @@ fn what_is_wrong_is_named_and_ends_with_1() {
         (&["--db", "none.dbc", "trace.log"], "cantap: cannot read database none.dbc: No such file"),
         (&["--db", "trace.log", "trace.log"], "cantap: trace.log is no known kind of database"),
         (&["--db", "body.dbc", "none.log"], "cantap: cannot open none.log"),
-        (&["trace.log"], "cantap: no database to decode by; give one with --db FILE"),
         (
             &["--db", "dashboard.toml", "trace.log", "-s", "Sped"],
             "cantap: --signal: no signal of the databases matches \"Sped\"; did you mean Speed?",

@@ -148,6 +148,12 @@ fn a_device_that_vanishes_while_its_bit_rate_is_looked_for_comes_back_too() {
     let line = format!("monitor -d {} -b 500k --view statistics", port.name());
     let mut view = Terminal::start(&line, (120, 24));
     view.wait_for("running");
+    // It can be stopped.
+    view.keys("A");
+    view.wait_for("A stops");
+    view.keys("A");
+    view.wait_for("channel 1: stopped");
+    view.wait_for("running");
     view.keys("A");
     view.wait_for("A stops");
     port.unplug();
@@ -157,10 +163,10 @@ fn a_device_that_vanishes_while_its_bit_rate_is_looked_for_comes_back_too() {
     view.keys("A");
     view.wait_for("channel 1: 250000 bit/s; channel 2: 250000 bit/s");
     view.wait_for("Channel 1: 250000 bit/s");
-    // It can be stopped, and left.
-    view.keys("A");
-    view.wait_for("A stops");
-    view.keys("A");
+    // And left.
+    port.unplug();
+    view.wait_for("GONE, trying again");
+    port.plug("load=0,bitrate=250k");
     view.wait_for("running");
     view.keys("A");
     view.wait_for("A stops");

@@ -60,13 +60,73 @@ fn one_screen_is_text_of_the_size_that_was_asked_for() {
 }
 
 #[test]
+fn an_address_given_bare_is_the_device() {
+    let (code, out, err) = cantap("monitor virtual:car --once -t 1s --view signals --size 120x50");
+    assert!(
+        code == Some(0) && out.contains("EngineSpeed") && err.contains("virtual car --dbc"),
+        "{err}{out}"
+    );
+    let (code, out, err) = cantap("monitor virtual:load=30 -c 2 --once -t 800ms --view statistics");
+    assert!(code == Some(0) && out.contains("Channel 2: ") && !out.contains("Channel 1: "), "{err}{out}");
+    for (line, code, part) in [
+        ("monitor virtual:speed=5 --once", 2, "there is no option 'speed'"),
+        ("monitor /dev/ttyACM99 -b 500k --once", 1, "there is no device at '/dev/ttyACM99'"),
+        ("monitor host/formats/tests/data/nmea2000.log.gz -c 1 --once", 2, "-c chooses a device's channels"),
+        ("monitor virtual -d virtual --once", 2, "--device"),
+    ] {
+        let (got, _, err) = cantap(line);
+        assert!(got == Some(code) && err.contains(part), "{line}: {got:?} {err}");
+    }
+}
+
+#[test]
+fn a_profile_is_read_where_it_is_and_what_it_names_must_be_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let write = |name: &str, text: &str| std::fs::write(folder.path().join(name), text).unwrap();
+    std::fs::create_dir(folder.path().join("db")).unwrap();
+    write(
+        "db/car.toml",
+        "version = 1\n[[message]]\nname = \"Engine\"\nid = 0x123\nlength = 1\n[[message.signal]]\nname = \"Speed\"\nat = \"D1\"\n",
+    );
+    write("drive.log", "(1.0) can0 123#11\n(2.0) can0 123#22\n(3.0) can0 123#33\n");
+    let once = |profile: &str, more: &str| {
+        write("car-profile.toml", profile);
+        let path = |name: &str| folder.path().join(name).display().to_string();
+        cantap(&format!("monitor {} -p {} --once {more}", path("drive.log"), path("car-profile.toml")))
+    };
+    // The test runs in another folder than the profile's.
+    for graph in ["Speed", "Engine.Speed", "Engine.*"] {
+        let (code, out, err) =
+            once(&format!("databases = [\"db/car.toml\"]\ngraph = [\"{graph}\"]\nview = \"graph\"\n"), "");
+        assert!(code == Some(0) && err.is_empty() && out.contains("Speed 51"), "{graph}: {err}{out}");
+    }
+    let recorded = folder.path().join("again.log");
+    let (code, _, err) = once("record = \"again.log\"\n", "");
+    assert!(code == Some(0) && recorded.exists(), "{err}");
+    for (profile, more, part) in [
+        (
+            "databases = [\"db/car.toml\"]\ngraph = [\"Sped\"]\n",
+            "",
+            "no signal of the databases matches \"Sped\"; did you mean Speed?",
+        ),
+        ("databases = [\"db/car.toml\"]\ngraph = [\"Body.Speed\"]\n", "", "\"Body.Speed\""),
+        ("databases = [\"car.toml\"]\n", "", "car.toml"),
+        ("", "--db nothing.dbc", "nothing.dbc"),
+        ("speed = 5\n", "", "unknown field `speed`"),
+    ] {
+        let (code, out, err) = once(profile, more);
+        assert!(code == Some(1) && out.is_empty() && err.contains(part), "{profile}: {code:?} {err}");
+    }
+}
+
+#[test]
 fn channels_are_opened_as_by_the_other_commands() {
     for (line, parts) in [
         ("-b 500k -b 2:250k", vec!["Channel 1: 500000 bit/s", "Channel 2: 250000 bit/s", "listen-only"]),
         ("-b 2:250k", vec!["Channel 2: 250000 bit/s"]),
         ("-c 1", vec!["Channel 1: 500000 bit/s"]),
         ("--segments 9,13,2,2", vec!["Channel 1: 250000 bit/s", "Channel 2: 250000 bit/s"]),
-        ("-b 500k --sample-point 75 --mode normal", vec!["Channel 1: 500000 bit/s", " normal: running"]),
+        ("-b 500k --sample-point 75 --mode normal", vec!["Channel 1: 500000 bit/s", " NORMAL: running"]),
         ("-b 500k --mode loopback", vec![" loopback: running"]),
     ] {
         let line =

@@ -3,6 +3,7 @@
 #![cfg(unix)]
 
 mod firmware;
+mod port;
 #[expect(dead_code, reason = "other tests use the rest of it")]
 mod terminal;
 
@@ -50,9 +51,9 @@ fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
     }
     let file = write(folder.path(), "long.log", &log);
     let mut view = Terminal::start(&format!("monitor {file} -b 500k --view trace"), (120, 24));
-    view.wait_for("playing, delay ×1");
+    view.wait_for("playing ×1 ");
     view.keys(",");
-    view.wait_for("delay ×2");
+    view.wait_for("×0.5 ");
     view.keys("p");
     view.wait_for("stopped");
     let rows = |screen: &str| screen.lines().filter(|line| line.contains(" D 1 11")).count();
@@ -60,7 +61,7 @@ fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
     view.keys(">>");
     view.wait_until("two more", |screen| rows(screen) == before + 2);
     view.keys("p..........");
-    view.wait_for("ended, as fast as can be");
+    view.wait_for("ended as fast as can be");
     // It sends nothing, and says what would.
     view.keys("6a123#1122\r\r");
     view.wait_for("a file sends nothing; open a device with D");
@@ -116,6 +117,140 @@ fn a_recording_on_a_condition_has_what_is_around_the_events_only() {
     assert_eq!(records[20].frame().unwrap().data(), [100]);
 }
 
+/// Ten records a second for a hundred seconds, each with its number.
+fn hundred_seconds(folder: &Path) -> String {
+    let mut log = String::new();
+    for n in 0..=1000 {
+        writeln!(log, "({}.{:06}) can0 {:03X}#{n:04X}", 5000 + n / 10, n % 10 * 100_000, 0x100 + n % 8)
+            .unwrap();
+    }
+    write(folder, "drive.log", &log)
+}
+
+#[test]
+fn in_a_file_one_goes_to_any_place_and_sees_what_it_has_up_to_there() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = hundred_seconds(folder.path());
+    let mut view = Terminal::start(&format!("monitor {file} -b 500k --view trace"), (120, 24));
+    view.wait_for("drive.log: playing ×1 ");
+    view.wait_for("/ 1:40");
+    view.keys("pT50%\r");
+    let text = view.wait_for("stopped ×1 0:50 / 1:40");
+    // The last one before that place, and all before it, once each.
+    assert!(text.contains("01 F3") && !text.contains("01 F5"), "{text}");
+    view.keys("B5");
+    view.wait_for("Frames           500");
+    // Back: nothing is there twice.
+    view.keys("[");
+    view.wait_for("0:40 / 1:40");
+    view.wait_for("Frames           400");
+    view.keys("}");
+    view.wait_for("Frames           500");
+    view.keys("]T1:35\r");
+    view.wait_for("1:35 / 1:40");
+    view.keys(" ");
+    view.wait_for("ended ×1 1:40 / 1:40");
+    view.wait_for("Frames          1001");
+    // From its end it begins anew.
+    view.keys(" ");
+    view.wait_for("playing ×1 0:0");
+    view.keys("...");
+    view.wait_for("playing ×10 ");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_trace_opens_beside_a_device_that_goes_on_being_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = hundred_seconds(folder.path());
+    let recording = folder.path().join("live.log");
+    let line =
+        format!("monitor virtual:load=30,frames=std8 -b 500k --view statistics -o {}", recording.display());
+    let mut view = Terminal::start(&line, (140, 30));
+    view.wait_for("REC");
+    view.keys(&format!("D\x15{file}\r"));
+    let text = view.wait_for("w 2 of 2");
+    assert!(!text.contains("REC"), "{text}");
+    view.wait_for("drive.log: playing");
+    let size = || std::fs::metadata(&recording).unwrap().len();
+    let before = size();
+    std::thread::sleep(std::time::Duration::from_millis(1200));
+    assert!(size() > before, "{before}");
+    view.keys("w");
+    let text = view.wait_for("w 1 of 2");
+    assert!(
+        text.contains("virtual:load=30,frames=std8 listen-only: running") && text.contains("REC"),
+        "{text}"
+    );
+    view.keys("w");
+    view.wait_for("w 2 of 2");
+    view.keys("W");
+    view.wait_until("one source", |screen| !screen.contains("of 2") && screen.contains("REC"));
+    view.keys("W");
+    view.wait_for("there is no other source; q leaves");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    assert!(view.text().contains("records are in"), "{}", view.text());
+    let records: Vec<_> =
+        open_reader(&recording, &ReadOptions::default()).unwrap().map(Result::unwrap).collect();
+    assert!(
+        records.len() > 1000 && records.iter().all(|record| record.frame().is_some()),
+        "{}",
+        records.len()
+    );
+}
+
+#[test]
+fn a_vehicle_at_a_serial_port_is_known_by_its_signals() {
+    let mut port = port::Port::new();
+    port.plug("car");
+    let line = format!("monitor {} -b 500k -b 2:125k --view fixed", port.name());
+    let mut view = Terminal::start(&line, (200, 60));
+    view.wait_for("`cantap virtual car --dbc` prints it");
+    view.wait_for("EngineSpeed");
+    // A row opens, and a signal goes into the graph with its past.
+    view.keys("3");
+    view.wait_for("Last 8 s");
+    view.keys("/.enginespeed\r");
+    view.wait_until("no prompt", |screen| !screen.contains(" > "));
+    view.keys("\r4");
+    let graph = view.wait_for("rpm EngineSpeed ");
+    assert!(graph.contains(" UTC") && graph.contains("10 s, steps"), "{graph}");
+    view.keys("xx");
+    view.wait_for("Δt 0.000000 s");
+    view.resize((80, 24));
+    view.wait_for("Δt 0.000000 s");
+    view.resize((1, 1));
+    view.resize((80, 24));
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
+#[test]
+fn a_channel_that_is_bus_off_is_brought_back_from_inside() {
+    let line = "monitor virtual:load=0,disturb=32 -b 500k --normal --recovery manual --view send";
+    let mut view = Terminal::start(line, (140, 24));
+    view.wait_for("NORMAL: running");
+    view.keys("R");
+    view.wait_for("no channel is bus-off");
+    view.keys("a123#11\r\r");
+    view.wait_for("1: BUS-OFF, R recovers");
+    view.keys("R");
+    view.wait_for("channel 1 comes back onto its bus");
+    view.wait_until("it is back", |screen| !screen.contains("BUS-OFF"));
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+    // By itself after a time, as by every other command.
+    let line = "monitor virtual:load=0,disturb=32 -b 500k --normal --recovery 100ms --view send";
+    let mut view = Terminal::start(line, (140, 24));
+    view.wait_for("NORMAL: running");
+    view.keys("a123#11\r\r");
+    view.wait_for("channel 1 was bus-off and joins the bus again");
+    view.keys("q");
+    assert_eq!(view.end(), 0);
+}
+
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn the_emulated_board_is_watched_sent_with_and_recorded() {
@@ -133,7 +268,7 @@ fn the_emulated_board_is_watched_sent_with_and_recorded() {
     view.wait_for("Device olimex-p405");
     // Into the bus, and onto it.
     view.keys("my\r");
-    view.wait_for("normal: running");
+    view.wait_for("NORMAL: running");
     view.keys("6a6F7#DEADBEEF\r\r1f6F7:7FF\r");
     view.wait_for("T      6F7 D 4 DE AD BE EF");
     view.keys("q");

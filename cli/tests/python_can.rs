@@ -21,8 +21,35 @@ bus.shutdown()
 print("done")
 "#;
 
+/// What python-can sends for a rate is what the device is at: it reads no answer that could tell otherwise.
+const RATE: &str = r#"
+import sys, can
+bus = can.Bus(interface="slcan", channel=sys.argv[1], bitrate=int(sys.argv[2]), listen_only=True, sleep_after_open=0.2)
+print("heard" if bus.recv(5) is not None else "nothing")
+bus.shutdown()
+"#;
+
+/// Those of its rates that Lawicel's manual has not, or has otherwise.
+#[test]
+fn python_cans_own_bit_rates_are_what_it_means_by_them() {
+    for (asked, bus) in [("750000", "750k"), ("83300", "83.333k"), ("500000", "500k")] {
+        let Some(output) = on_virtual_device(&format!("load=20,frames=std8,bitrate={bus}"), &[RATE, asked])
+        else {
+            return;
+        };
+        assert_eq!(output, "heard\n", "{asked}");
+    }
+}
+
 #[test]
 fn python_can_talks_to_the_virtual_device() {
+    if let Some(output) = on_virtual_device("load=5,frames=std8", &[PROGRAM]) {
+        assert_eq!(output, "done\n");
+    }
+}
+
+/// What a program prints that gets the virtual device's port and what stands behind it here; `None` without python-can.
+fn on_virtual_device(options: &str, program: &[&str]) -> Option<String> {
     let python = std::env::var("CANTAP_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let imports = Command::new(&python).args(["-c", "import can, serial"]).output();
     if !imports.is_ok_and(|output| output.status.success()) {
@@ -31,24 +58,20 @@ fn python_can_talks_to_the_virtual_device() {
             "{python} has no python-can with pyserial"
         );
         eprintln!("SKIPPED: {python} has no python-can with pyserial; name one that has in CANTAP_PYTHON");
-        return;
+        return None;
     }
     let mut device = Command::new(env!("CARGO_BIN_EXE_cantap"))
-        .args(["virtual", "load=5,frames=std8"])
+        .args(["virtual", options])
         .stdout(Stdio::piped())
         .stderr(Stdio::null())
         .spawn()
         .unwrap();
     let mut path = String::new();
     BufReader::new(device.stdout.take().unwrap()).read_line(&mut path).unwrap();
-    let output = Command::new(&python).args(["-c", PROGRAM, path.trim()]).output();
+    let output = Command::new(&python).args(["-c", program[0], path.trim()]).args(&program[1..]).output();
     device.kill().unwrap();
     device.wait().unwrap();
     let output = output.unwrap();
-    assert_eq!(
-        String::from_utf8_lossy(&output.stdout),
-        "done\n",
-        "{}",
-        String::from_utf8_lossy(&output.stderr)
-    );
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    Some(String::from_utf8(output.stdout).unwrap())
 }

@@ -129,7 +129,7 @@ fn finding_nothing_ends_with_1_and_a_bad_condition_with_2_and_is_marked() {
     let (code, _, err) = cantap("nothing", &["search", "a.log", "Speed > 3"]);
     assert_eq!(code, Some(2));
     assert!(err.contains("load one with --db"), "{err}");
-    assert_eq!(cantap("nothing", &["search", "a.log"]).0, Some(1));
+    assert_eq!(cantap("nothing", &["search", "a.log"]).0, Some(2));
     assert_eq!(cantap("nothing", &["search", "a.log", "--id", "123456789"]).0, Some(2));
 }
 

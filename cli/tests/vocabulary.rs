@@ -117,6 +117,29 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
             "the name 'x.foo' does not tell the format; name it with",
         ),
         (format!("convert {TRACE} x.foo"), "the name 'x.foo' does not tell the format"),
+        (
+            format!("search {TRACE} --id 123 -o x.foo"),
+            "cannot write x.foo: the name 'x.foo' does not tell the format",
+        ),
+        (
+            format!("align {TRACE} {TRACE} -o x.foo"),
+            "cannot write x.foo: the name 'x.foo' does not tell the format",
+        ),
+        ("demo -t 100ms -o x.foo".to_owned(), "the name 'x.foo' does not tell the format"),
+        (
+            "monitor -d virtual -b 500k --once -o x.foo".to_owned(),
+            "the name 'x.foo' does not tell the format",
+        ),
+        (format!("plot {TRACE} --bus-load -o x.foo"), "'x.foo' names no picture format; let it end in .svg"),
+        (format!("decode {TRACE}"), "no database to decode by; give one with --db FILE"),
+        (format!("plot {TRACE}"), "no database to find signals in; give one with --db FILE"),
+        (format!("search {TRACE}"), "nothing to look for; give --id, --data or a condition"),
+        (
+            "search -d virtual -c 3 --id 1".to_owned(),
+            "cantap: a device has channels 1 and 2, and no channel 3",
+        ),
+        // It is for what is written.
+        (format!("stats {TRACE} --format asc"), "unexpected argument '--format'"),
         ("send -d virtual 123#11".to_owned(), "as in: cantap send 1 123#11"),
         ("capture -d virtual -b 500k -f 12x".to_owned(), "neither an ID, such as 123"),
         ("capture -d virtual -b 500k -c 3".to_owned(), "a device has channels 1 and 2, and no channel 3"),
@@ -131,8 +154,19 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
     let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there}"));
     assert!(code == Some(1) && err.contains("there already"), "{err}");
     assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
-    let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there} --force"));
-    assert_eq!(code, Some(0), "{err}");
+    let (code, _, err) = cantap(&format!("monitor -d virtual -b 500k --once -o {there}"));
+    assert!(code == Some(1) && err.contains("there already"), "{err}");
+    assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
+    for command in ["capture -d virtual -b 500k -n 5", "monitor -d virtual -b 500k --once -t 100ms"] {
+        let (code, _, err) = cantap(&format!("{command} -o {there} --force"));
+        assert_eq!(code, Some(0), "{err}");
+        assert_ne!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
+        std::fs::write(folder.path().join("there.log"), "kept").unwrap();
+    }
+    let found = folder.path().join("found");
+    let (code, _, err) =
+        cantap(&format!("search {TRACE} --id 9F80102 -m 1 -o {} --format asc", found.display()));
+    assert!(code == Some(0) && std::fs::read_to_string(&found).unwrap().starts_with("date "), "{err}");
     // What candump's users type.
     let (code, out, err) = cantap("capture -d virtual:frames=std8 -b 500k -f 123 -t 300ms");
     assert!(code == Some(0) && out.lines().all(|line| line.contains(" 123#")), "{err}{out}");

@@ -17,13 +17,14 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PROTOCOL = 3, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
+enum { PROTOCOL = 4, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
 
 static const char *const REPLIES[] = {"Hello", "Done", "Opened", "Status", "Time", "Filters", "Queued", "Registers", "Defaults",
-                                      "Failures"};
+                                      "Failures", "Edges"};
 static const char *const REFUSALS[] = {"Protocol", "Malformed", "NoSession", "Unsupported", "BadTiming", "BadId", "BadDlc",
                                        "BadTag", "BadEntry", "BadSlot", "ChannelOpen", "ChannelClosed", "ListenOnly", "QueueFull",
-                                       "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff"};
+                                       "BanksExhausted", "WouldDisturb", "TooFarAhead", "Hardware", "NothingSaved", "NotBusOff",
+                                       "NotMeasuring", "NotGranted", "Held", "OtherSettings", "NoBoard"};
 static const char *const STAGES[] = {"controller", "queue", "link", "host"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};
@@ -209,7 +210,7 @@ static void response(Reader *m) {
     unsigned index = (unsigned)number(m);
     if (!m->ok) { puts("unreadable"); return; }
     printf("response %u %s%s", id, refused ? "refused " : "", refused ? NAME(REFUSALS, index) : NAME(REPLIES, index));
-    if (refused) for (int n = index == 14 ? 2 : index == 0 || index == 13; n > 0; n--) printf(" %" PRIu64, number(m));
+    if (refused) for (int n = index == 14 ? 2 : index == 0 || index == 13 || index == 20; n > 0; n--) printf(" %" PRIu64, number(m));
     puts("");
     if (!refused && index == HELLO) sequence = frames[0] = frames[1] = lost[0] = lost[1] = 0;
     size_t len = (size_t)(m->end - m->at);

@@ -6,11 +6,12 @@
 """
 import os, select, sys, time, tty, zlib
 
-PROTOCOL = 3
-REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures".split()
+PROTOCOL = 4
+REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
-            "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff").split()
-NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2}  # numbers behind a refusal
+            "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
+            "NotMeasuring NotGranted Held OtherSettings NoBoard").split()
+NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1}  # numbers behind a refusal
 STAGES = "controller queue link host".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
 STATES = "active warning passive bus-off".split()

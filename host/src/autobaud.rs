@@ -1,74 +1,68 @@
-//! Finds a bus's bit rate without a word: the channel only listens, at one rate after the other.
+//! Finds a bus's bit rate without a word, by measuring it.
 //!
-//! A rate is right when several frames in a row arrive without an error. Near rates pass that test too, since controllers
-//! resynchronise: 253.97 kbit/s may be heard at 250. So a common rate must be heard again with the sample point as late
-//! as it can be, where 1.5 % are too much; and for any other the rates around are listened to, until the frames themselves tell
-//! how fast the bus is (`hearing.rs`).
+//! The device tells the edges of the channel's receive pin while its controller is off the bus. One frame is enough to know the length of a
+//! bit to a thousandth ([`measure`]), whatever the bit rate; where none is whole, pieces of many give a guess ([`rough`]). What the clock
+//! reaches of that is [`rates`]'. The controller then listens at that rate, to confirm it with frames of its own. Nothing is ever driven.
 
-mod hearing;
+mod measure;
 mod rates;
+mod reading;
+mod rough;
 
 use std::time::Duration;
 
-use cantap_wire::message::ChannelConfig;
+use cantap_wire::message::{ChannelConfig, Edges, MAX_EDGES};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
-use cantap_wire::{BitTiming, Channel, Command, Frame};
+use cantap_wire::{BitTiming, Channel};
 
-use self::hearing::Bounds;
+use self::measure::{Measured, measure};
 pub use self::rates::COMMON_BPS;
-use self::rates::{SAME, clocks_of, next_to_study, round_rates, scan_rates, sharpest};
-use crate::device::Records;
-use crate::{Device, DeviceError, Direction, TraceEvent, TraceFrame, bits_on_bus};
+use self::rates::{Reached, reach};
+use self::reading::PinEdge;
+use self::rough::estimate;
+use crate::{Device, DeviceError};
 
-/// Good frames in a row that make a candidate.
+/// Frames that the controller has to hear.
 const GOOD_FRAMES: u32 = 4;
-/// Good frames in a row that a common rate needs with the sharpest timing: at a neighbour some frames pass, and more in a row
-/// rarely.
-const SHARP_FRAMES: u32 = 10;
-/// Frames and errors that are weighed where there are both: a frame may have been destroyed at the right rate, too.
-const WEIGHED_FRAMES: u32 = 24;
-/// The right rate is wrong about fewer than one frame in this many.
-const FRAMES_PER_ERROR: u32 = 8;
-/// Frames and errors that are looked at where both tell something.
-const STUDY_FRAMES: u32 = 8;
-/// A rate at which a frame was heard is listened to for this long at least.
-const PATIENCE: Duration = Duration::from_secs(2);
+/// With fewer, an answer is given after this time.
+const ANSWER_AFTER: Duration = Duration::from_secs(1);
+/// The controller listens for so long at least, if it hears nothing.
+const LISTEN: Duration = Duration::from_millis(100);
+/// Errors without a frame between them that say that a measured rate was wrong, or that no frame ends well.
+const MOST_ERRORS: u32 = 12;
+/// How often it is measured again then.
+const ROUNDS: u32 = 3;
 /// How often the device is asked.
 const ASK_EVERY: Duration = Duration::from_millis(2);
-/// Frames of one rate that are measured.
-const MOST_MEASURED: u32 = 32;
-/// Frames that are kept to compare with.
-const KEPT_FRAMES: usize = 16;
-/// Rates around a candidate that are studied.
-const MOST_STUDIED: usize = 12;
-/// Error of a stamp's difference, in ns: the interrupt's latency.
-const STAMP_ERROR_NS: f64 = 3_000.0;
+/// A measurement is good enough at this standard error, and else goes on for a while.
+const GOOD_ERROR: f64 = 0.000_3;
+/// Is what is measured not better after this time, it is taken as it is.
+const BETTER_WITHIN: Duration = Duration::from_millis(150);
+/// Edges that are looked at together: those of half a dozen frames.
+const MOST_EDGES: usize = 700;
+/// New edges that are worth a look while there is no pause: those of two frames.
+const MANY_EDGES: usize = 120;
+/// Where so much was seen for so long and not one frame was whole, a guess must do.
+const GUESS_EDGES: u64 = 300;
+/// See [`GUESS_EDGES`].
+const GUESS_AFTER: Duration = Duration::from_millis(250);
+/// Without a pause between frames, a look is due after this time.
+const LOOK_EVERY: Duration = Duration::from_millis(40);
 
 /// What the search is doing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Progress {
-    /// Trying one of the common rates: which, of how many.
-    Common {
-        /// In bit/s.
-        bitrate_bps: u32,
-        /// From 0.
-        at: usize,
-        /// How many.
-        of: usize,
+    /// Measuring bits.
+    Measuring {
+        /// Edges seen so far.
+        edges: u64,
     },
-    /// Trying every reachable rate.
-    Scan {
+    /// Frames were measured; the controller listens for more at their rate.
+    Confirming {
         /// In bit/s.
         bitrate_bps: u32,
-        /// From 0.
-        at: usize,
-        /// How many.
-        of: usize,
-    },
-    /// Frames arrive; making sure of it.
-    Checking {
-        /// In bit/s.
-        bitrate_bps: u32,
+        /// Good frames so far.
+        frames: u32,
     },
 }
 
@@ -77,22 +71,41 @@ pub enum Progress {
 pub enum Outcome {
     /// The bit rate.
     Found {
-        /// In bit/s.
+        /// In bit/s, as the controller has it.
         bitrate_bps: u32,
+        /// What was measured, in bit/s by the device's clock.
+        measured_bps: f64,
         /// The timing that it was heard with.
         timing: BitTiming,
-        /// Good frames heard at the end.
+        /// Good frames, measured and heard.
         frames: u32,
     },
     /// Nothing happened on the bus.
     NoTraffic,
-    /// Something did, and no rate fitted.
-    NoMatch {
-        /// Errors seen.
-        errors: u64,
-        /// The bus's bit rate in bit/s, where frames told it, and no rate that the controller's clock reaches is near
-        /// enough to receive every frame.
-        about_bps: Option<f64>,
+    /// The bus is dominant, and stays so.
+    Stuck,
+    /// Something happened, but nothing of it was a whole frame.
+    Unreadable {
+        /// Changes of the level.
+        edges: u64,
+    },
+    /// No rate that the controller's clock reaches is near enough to receive every frame.
+    Unreachable {
+        /// What was measured, in bit/s.
+        measured_bps: f64,
+        /// The nearest that the clock reaches, in bit/s.
+        nearest_bps: Option<u32>,
+    },
+    /// The bits were measured, and then no good frame came.
+    Unconfirmed {
+        /// In bit/s, as the controller has it.
+        bitrate_bps: u32,
+        /// What was measured, in bit/s.
+        measured_bps: f64,
+        /// Whether anybody acknowledged what was measured; true if no frame was whole.
+        acknowledged: bool,
+        /// Errors that the controller saw.
+        errors: u32,
     },
     /// It was asked to stop.
     Stopped,
@@ -101,136 +114,81 @@ pub enum Outcome {
 /// How long to look, by the device's clock.
 #[derive(Clone, Copy, Debug)]
 pub struct Limits {
-    /// At each rate while nothing at all happens; the first round. Later rounds take longer.
-    pub dwell: Duration,
-    /// Altogether, while the bus is silent; but each common rate is tried once.
+    /// Without anything new.
     pub silence: Duration,
 }
 
 impl Default for Limits {
-    /// For 20 frames a second and more; a silent bus is given up after ten seconds.
+    /// A silent bus is given up after ten seconds.
     fn default() -> Self {
-        Self { dwell: Duration::from_millis(60), silence: Duration::from_secs(10) }
-    }
-}
-
-/// What was heard at one rate.
-#[derive(Clone, Copy, Debug)]
-struct Heard {
-    frames: u32,
-    errors: u32,
-    /// Shortest bit that the stamps of neighbouring frames allow, as the highest rate, in bit/s.
-    fastest_bps: Option<f64>,
-    /// Of the bus's rate, by the frames themselves.
-    bounds: Bounds,
-}
-
-impl Default for Heard {
-    fn default() -> Self {
-        Self { frames: 0, errors: 0, fastest_bps: None, bounds: Bounds::NONE }
-    }
-}
-
-impl Heard {
-    const fn is_good(&self) -> bool {
-        let seen = self.frames + self.errors;
-        self.frames >= GOOD_FRAMES && self.errors == 0
-            || seen >= WEIGHED_FRAMES && self.errors * FRAMES_PER_ERROR < seen
+        Self { silence: Duration::from_secs(10) }
     }
 }
 
 struct Search<'a> {
     device: &'a Device,
     channel: Channel,
-    records: Records,
-    /// Some that were received, near the bus's rate.
-    frames: Vec<Frame>,
+    limits: &'a Limits,
     progress: &'a mut dyn FnMut(Progress) -> bool,
-    errors: u64,
-    /// Something was heard, be it an error.
-    heard: bool,
-    /// The device's time at which a bus that is still silent is given up.
-    give_up: u64,
-    stopped: bool,
+    /// The device's time at the beginning, and when something was last heard.
+    began: u64,
+    heard: u64,
+    /// Changes of the level altogether.
+    seen: u64,
 }
 
-/// Finds the bit rate of a channel's bus. `progress` is called for each rate and ends the search by returning
-/// false. The channel has to be closed, and is so afterwards.
+/// Finds the bit rate of a channel's bus. `progress` is called again and again, and ends the search by returning false. The channel has to
+/// be closed, and is so afterwards.
 pub fn search(
     device: &Device,
     channel: Channel,
     limits: &Limits,
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Outcome, DeviceError> {
-    let records = device.records();
-    let mut search = Search {
-        device,
-        channel,
-        records,
-        frames: Vec::new(),
-        progress,
-        errors: 0,
-        heard: false,
-        give_up: u64::MAX,
-        stopped: false,
-    };
-    let give_up = device.time()?.saturating_add(search.ticks(limits.silence));
-    let mut dwell = limits.dwell;
-    loop {
-        // Traffic that is there and fits none of the common rates is worth the long scan. Before it they are tried
-        // again: what came first at the right one may have been a frame that was destroyed.
-        let of = COMMON_BPS.len();
-        for _ in 0..2 {
-            let common = COMMON_BPS.into_iter().enumerate();
-            let rates = common.map(|(at, bitrate_bps)| Progress::Common { bitrate_bps, at, of });
-            if let Some(found) = search.try_all(rates, dwell)? {
-                return Ok(found);
-            }
-            if search.errors == 0 {
-                break;
-            }
-        }
-        if search.errors > 0 {
-            let grid = scan_rates(device.hello().can_clock_hz);
-            let of = grid.len();
-            let rates = grid.into_iter().enumerate();
-            let rates = rates.map(|(at, bitrate_bps)| Progress::Scan { bitrate_bps, at, of });
-            let found = search.try_all(rates, dwell)?;
-            return Ok(found.unwrap_or(Outcome::NoMatch { errors: search.errors, about_bps: None }));
-        }
-        search.give_up = give_up;
-        // A quiet bus needs longer looks.
-        dwell *= 3;
-    }
+    let began = device.time()?;
+    let mut search = Search { device, channel, limits, progress, began, heard: began, seen: 0 };
+    let outcome = search.run();
+    // Also where the search was given up in the middle.
+    let ended = device.measure_edges(None);
+    let outcome = outcome?;
+    ended.map(|()| outcome)
+}
+
+/// What one measurement came to.
+enum Heard {
+    /// Of frames, or of none where it is a guess.
+    Frames(Measured),
+    /// The search is over.
+    Over(Outcome),
 }
 
 impl Search<'_> {
-    fn try_all(
-        &mut self,
-        rates: impl Iterator<Item = Progress>,
-        dwell: Duration,
-    ) -> Result<Option<Outcome>, DeviceError> {
-        for step in rates {
-            let (Progress::Common { bitrate_bps, .. }
-            | Progress::Scan { bitrate_bps, .. }
-            | Progress::Checking { bitrate_bps }) = step;
-            if self.stopped || !(self.progress)(step) {
-                return Ok(Some(Outcome::Stopped));
-            }
-            if !self.heard && self.device.time()? > self.give_up {
-                return Ok(Some(Outcome::NoTraffic));
-            }
-            let Ok(timing) = self.device.timing(bitrate_bps) else { continue };
-            let heard = self.find(timing, Purpose::Find, dwell)?;
-            self.errors += u64::from(heard.errors);
-            self.heard |= heard.frames + heard.errors > 0;
-            if heard.is_good()
-                && let Some(found) = self.make_sure(bitrate_bps, heard, dwell)?
-            {
-                return Ok(Some(found));
+    fn run(&mut self) -> Result<Outcome, DeviceError> {
+        let mut rounds = 0;
+        // That the clock does not reach a rate is said of two frames, and a contradiction measured again.
+        let mut wanted = 1;
+        loop {
+            let measured = match self.measure(wanted)? {
+                Heard::Frames(measured) => measured,
+                Heard::Over(outcome) => return Ok(outcome),
+            };
+            let measured_bps = f64::from(self.device.hello().tick_hz) / measured.bit_ticks;
+            let bitrate_bps = match reach(self.device.hello().can_clock_hz, measured_bps, measured.error) {
+                Reached::At { bitrate_bps } => bitrate_bps,
+                Reached::Not { .. } if measured.frames == 1 && wanted == 1 => {
+                    wanted = 2;
+                    continue;
+                }
+                Reached::Not { nearest_bps } => {
+                    return Ok(Outcome::Unreachable { measured_bps, nearest_bps });
+                }
+            };
+            rounds += 1;
+            match self.confirm(bitrate_bps, measured, measured_bps)? {
+                Outcome::Unconfirmed { errors: MOST_ERRORS.., .. } if rounds < ROUNDS => {}
+                outcome => return Ok(outcome),
             }
         }
-        Ok(None)
     }
 
     /// A time in the device's ticks.
@@ -238,218 +196,126 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
-    /// Listens with a timing whether it is the right one. Where there are frames and errors, again, to weigh them.
-    fn find(&mut self, timing: BitTiming, purpose: Purpose, dwell: Duration) -> Result<Heard, DeviceError> {
-        let heard = self.listen(timing, purpose, dwell)?;
-        if heard.frames > 0 && heard.errors > 0 {
-            self.listen(timing, Purpose::Weigh, dwell)
-        } else {
-            Ok(heard)
+    /// Measures until so many frames were read, or nothing new comes.
+    fn measure(&mut self, wanted: u32) -> Result<Heard, DeviceError> {
+        let tick_hz = f64::from(self.device.hello().tick_hz);
+        // A little beyond what a device opens, so that a rate out there is named and not taken for another.
+        let [least, most] = [MAX_BITRATE_BPS, MIN_BITRATE_BPS].map(|bps| tick_hz / f64::from(bps));
+        self.device.measure_edges(Some(self.channel))?;
+        let mut edges: Vec<PinEdge> = Vec::new();
+        let (mut at, mut unread, mut looked) = (0.0, 0, self.began);
+        let guess_at = self.device.time()? + self.ticks(GUESS_AFTER);
+        // When the first frame was read, and what all of them tell.
+        let mut found: Option<(u64, Measured)> = None;
+        loop {
+            let told = self.device.edges()?;
+            let (new, now) = (told.edges.len(), told.ticks);
+            for edge in &told.edges {
+                at += f64::from(edge.ticks);
+                edges.push(PinEdge { at, dominant: edge.dominant, unsure: edge.unsure });
+            }
+            if new > 0 {
+                self.heard = now;
+                self.seen += new as u64;
+                unread += new;
+            }
+            if new == MAX_EDGES && unread < MOST_EDGES {
+                continue;
+            }
+            let is_due =
+                new == 0 || unread >= MANY_EDGES || now.saturating_sub(looked) > self.ticks(LOOK_EVERY);
+            if unread > 0 && is_due {
+                edges.drain(..edges.len().saturating_sub(MOST_EDGES));
+                (unread, looked) = (0, now);
+                if let Some(measured) = measure(&edges, least, most) {
+                    found = Some((found.map_or(now, |(since, _)| since), measured));
+                } else if found.is_none()
+                    && self.seen >= GUESS_EDGES
+                    && now > guess_at
+                    && let Some(guess) = estimate(&edges, least, most)
+                {
+                    return Ok(Heard::Frames(guess));
+                }
+            }
+            if let Some((since, measured)) = found {
+                let is_good =
+                    measured.error <= GOOD_ERROR || now.saturating_sub(since) > self.ticks(BETTER_WITHIN);
+                if measured.frames >= wanted && is_good {
+                    return Ok(Heard::Frames(measured));
+                }
+            }
+            if let Some(over) = self.is_over(&told, found.is_some()) {
+                return Ok(found.map_or(Heard::Over(over), |(_, measured)| Heard::Frames(measured)));
+            }
+            if !(self.progress)(Progress::Measuring { edges: self.seen }) {
+                return Ok(Heard::Over(Outcome::Stopped));
+            }
+            std::thread::sleep(ASK_EVERY);
         }
     }
 
-    /// Listens with a timing until there is evidence or the time is over.
-    fn listen(&mut self, timing: BitTiming, purpose: Purpose, dwell: Duration) -> Result<Heard, DeviceError> {
-        let clock_hz = self.device.hello().can_clock_hz;
-        if !(MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(&timing.bitrate_bps(clock_hz)) {
-            // Beyond what a device opens. Nothing of the bus can be there either.
-            return Ok(Heard::default());
+    /// Whether it is time to give up, and with what.
+    fn is_over(&self, told: &Edges, has_frames: bool) -> Option<Outcome> {
+        let limit = self.ticks(self.limits.silence);
+        let quiet = told.ticks.saturating_sub(self.heard) > limit;
+        let fruitless = !has_frames && told.ticks.saturating_sub(self.began) > limit;
+        match self.seen {
+            _ if quiet && told.dominant => Some(Outcome::Stuck),
+            0 if quiet => Some(Outcome::NoTraffic),
+            edges if quiet || edges > 0 && fruitless => Some(Outcome::Unreadable { edges }),
+            _ => None,
         }
+    }
+
+    /// Lets the controller listen at a rate that was measured.
+    fn confirm(
+        &mut self,
+        bitrate_bps: u32,
+        measured: Measured,
+        measured_bps: f64,
+    ) -> Result<Outcome, DeviceError> {
+        let timing = self.device.timing(bitrate_bps)?;
         let index = self.channel.index();
         let before = self.device.status()?.channels[index];
-        while self.records.next_batch(Duration::ZERO)?.is_some_and(|batch| !batch.is_empty()) {}
         self.device.open_channel(self.channel, Some(ChannelConfig::listen_only(timing)))?;
+        let outcome =
+            self.listen(bitrate_bps, measured, measured_bps, timing, before.frames, before.bus_errors);
+        self.device.close_channel(self.channel)?;
+        outcome
+    }
+
+    fn listen(
+        &mut self,
+        bitrate_bps: u32,
+        measured: Measured,
+        measured_bps: f64,
+        timing: BitTiming,
+        frames_before: u32,
+        errors_before: u32,
+    ) -> Result<Outcome, DeviceError> {
         // The device's time, not ours: an emulated one may be slower.
-        let started = self.device.time()?;
-        let mut dwell = self.ticks(dwell);
-        let mut heard = Heard::default();
+        let opened = self.device.time()?;
+        let answer_at = (self.began + self.ticks(ANSWER_AFTER)).max(opened + self.ticks(LISTEN));
         loop {
             std::thread::sleep(ASK_EVERY);
             let status = self.device.status()?;
-            let now = status.channels[index];
-            heard.frames = now.frames.wrapping_sub(before.frames);
-            heard.errors = now.bus_errors.wrapping_sub(before.bus_errors);
-            let enough = match purpose {
-                // A wrong rate shows at once.
-                Purpose::Find => heard.errors > 0 || heard.frames >= GOOD_FRAMES,
-                Purpose::Doubt { frames } => heard.errors > 0 || heard.frames >= frames,
-                Purpose::Weigh => heard.errors + heard.frames >= WEIGHED_FRAMES,
-                Purpose::Study => heard.errors + heard.frames >= STUDY_FRAMES,
-            };
-            if enough || status.ticks.saturating_sub(started) > dwell {
-                break;
+            let now = status.channels[self.channel.index()];
+            let frames = now.frames.wrapping_sub(frames_before);
+            let errors = now.bus_errors.wrapping_sub(errors_before);
+            // A frame that the controller took, or two that were read bit by bit and nothing that speaks against them.
+            let is_enough = frames > 0 || measured.frames > 1 && measured.acknowledged > 0 && errors == 0;
+            if frames >= GOOD_FRAMES || is_enough && status.ticks >= answer_at {
+                let frames = frames + measured.frames;
+                return Ok(Outcome::Found { bitrate_bps, measured_bps, timing, frames });
             }
-            // Frames are worth waiting for the next.
-            if heard.frames > 0 {
-                dwell = dwell.max(self.ticks(PATIENCE));
+            let is_late = status.ticks.saturating_sub(opened) > self.ticks(self.limits.silence);
+            if is_late || frames == 0 && errors >= MOST_ERRORS {
+                let acknowledged = measured.acknowledged > 0 || measured.frames == 0;
+                return Ok(Outcome::Unconfirmed { bitrate_bps, measured_bps, acknowledged, errors });
             }
-        }
-        self.device.request(Command::Close { channel: self.channel })?;
-        self.measure(&mut heard, timing)?;
-        Ok(heard)
-    }
-
-    /// What the frames tell of the bus's rate. Each by itself bounds it. And from the end of one to the end of the next are
-    /// at least the next one's bits, so their stamps show the highest rate that is possible.
-    fn measure(&mut self, heard: &mut Heard, timing: BitTiming) -> Result<(), DeviceError> {
-        let mut last_ns = None;
-        let mut studied = 0;
-        while let Some(batch) =
-            self.records.next_batch(Duration::from_millis(1))?.filter(|batch| !batch.is_empty())
-        {
-            for record in batch.iter().filter(|record| record.channel == self.channel.number()) {
-                let TraceEvent::Frame { frame: TraceFrame::Classic(frame), direction: Direction::Rx, late } =
-                    &record.event
-                else {
-                    last_ns = None;
-                    continue;
-                };
-                if studied < MOST_MEASURED {
-                    heard.bounds.narrow(Bounds::of(frame, timing, self.device.hello().can_clock_hz));
-                    studied += 1;
-                    if self.frames.len() < KEPT_FRAMES && !self.frames.contains(frame) {
-                        self.frames.push(*frame);
-                    }
-                }
-                if let Some(last_ns) = last_ns.filter(|_| !late) {
-                    let between_ns = (record.time_ns - last_ns) as f64 + STAMP_ERROR_NS;
-                    let bps = f64::from(bits_on_bus(frame)) * 1e9 / between_ns;
-                    heard.fastest_bps = Some(heard.fastest_bps.map_or(bps, |fastest| fastest.max(bps)));
-                }
-                last_ns = (!late).then_some(record.time_ns);
+            if !(self.progress)(Progress::Confirming { bitrate_bps, frames }) {
+                return Ok(Outcome::Stopped);
             }
         }
-        // Stamps are good to half a per cent only where frames are long; they bound the rate from below.
-        if let Some(fastest) = heard.fastest_bps {
-            heard.bounds.narrow(Bounds { least_bps: fastest * (1.0 - SAME), ..Bounds::NONE });
-        }
-        Ok(())
     }
-
-    /// Tells a candidate from its neighbours. `None` if it was a neighbour and none of them fits.
-    fn make_sure(
-        &mut self,
-        candidate_bps: u32,
-        heard: Heard,
-        dwell: Duration,
-    ) -> Result<Option<Outcome>, DeviceError> {
-        if !(self.progress)(Progress::Checking { bitrate_bps: candidate_bps }) {
-            return Ok(Some(Outcome::Stopped));
-        }
-        // It was heard, so silence from now on only means that more time is needed.
-        let dwell = dwell * 3;
-        let clock_hz = self.device.hello().can_clock_hz;
-        let rate = f64::from(candidate_bps);
-        let too_slow = heard.fastest_bps.is_some_and(|fastest| fastest > rate * (1.0 + SAME));
-        if COMMON_BPS.contains(&candidate_bps)
-            && !too_slow
-            && let Some(timing) = sharpest(clocks_of(clock_hz, rate))
-            && self.find(timing, Purpose::Doubt { frames: SHARP_FRAMES }, dwell)?.is_good()
-            && !self.is_slower_than(rate, dwell)?
-        {
-            return Ok(self.found(candidate_bps, heard));
-        }
-        // Each rate around that is heard, if only at times, narrows the bounds, and so does one at which what was heard
-        // before would have been heard too.
-        let mut bounds = heard.bounds;
-        let (mut tried, mut clean) = (Vec::new(), Vec::new());
-        while let Some(clocks) = next_to_study(clock_hz, &bounds, &tried)
-            && tried.len() < MOST_STUDIED
-        {
-            tried.push(clocks);
-            let usual = self.device.timing((f64::from(clock_hz) / f64::from(clocks)).round() as u32);
-            for timing in sharpest(clocks).into_iter().chain(usual) {
-                let heard = self.listen(timing, Purpose::Study, dwell)?;
-                bounds.narrow(heard.bounds);
-                if heard.is_good() && timing.jump_width == 1 && Some(timing) == sharpest(clocks) {
-                    clean.push(timing.bitrate_bps(clock_hz));
-                }
-                if heard.frames == 0 && heard.errors >= GOOD_FRAMES {
-                    bounds.exclude(Bounds::of_sure_reception(&self.frames, timing, clock_hz));
-                }
-            }
-        }
-        let Some(middle) = bounds.middle_bps() else { return Ok(None) };
-        let distance = |bps: &u32| (f64::from(*bps) - middle).abs();
-        let inside = |bps: &u32| (bounds.least_bps..=bounds.most_bps).contains(&f64::from(*bps));
-        let same = |bps: &u32| distance(bps) < middle * SAME;
-        let nearest = |a: &u32, b: &u32| distance(a).total_cmp(&distance(b));
-        // Buses have round rates. On a long or badly terminated one no edge is where it should be, and nothing is heard with the
-        // sharpest timing: then a common rate is the likeliest.
-        let candidates = [
-            COMMON_BPS.into_iter().find(same),
-            round_rates(clock_hz, &bounds).min_by(nearest),
-            clean.into_iter().min_by(nearest),
-            COMMON_BPS.into_iter().filter(inside).min_by(nearest),
-        ];
-        if candidates == [None; 4] {
-            return Ok(Some(Outcome::NoMatch { errors: self.errors, about_bps: Some(middle) }));
-        }
-        for bitrate_bps in candidates.into_iter().flatten() {
-            let heard = self.find(self.device.timing(bitrate_bps)?, Purpose::Find, dwell)?;
-            if heard.is_good() {
-                return Ok(self.found(bitrate_bps, heard));
-            }
-        }
-        Ok(None)
-    }
-
-    /// Whether the bus runs at a rate somewhat below the candidate's: then frames are heard a little below it that would not
-    /// be at the candidate's.
-    fn is_slower_than(&mut self, rate: f64, dwell: Duration) -> Result<bool, DeviceError> {
-        /// Nearer, the difference does not matter; farther down, nothing of either would be heard.
-        const REACH: [f64; 2] = [0.012, 0.05];
-        /// A smaller share of failing frames would take too many to be noticed.
-        const LEAST_SHARE: f64 = 0.15;
-        /// How likely it may be that none of this many frames is one that tells.
-        const CHANCE: f64 = 0.02;
-        /// Rates that are thought of.
-        const MOST_RATES: usize = 6;
-        /// Frames that each timing is tried with.
-        const SAMPLE: usize = 4;
-        let clock_hz = self.device.hello().can_clock_hz;
-        let failing = |timing: BitTiming| {
-            let fails = |frame: &&Frame| Bounds::of(frame, timing, clock_hz).most_bps < rate;
-            self.frames.iter().filter(fails).count() as f64 / self.frames.len().max(1) as f64
-        };
-        let [from, to] = REACH.map(|reach| clocks_of(clock_hz, rate * (1.0 - reach)));
-        let below = (from.max(clocks_of(clock_hz, rate) + 1)..=to)
-            .filter(|clocks| BitTiming::of_clocks(*clocks).next().is_some())
-            .take(MOST_RATES);
-        // Of the timings that would not take everything from the candidate, the one that takes most from a slower bus.
-        let sample = &self.frames[..self.frames.len().min(SAMPLE)];
-        let sure = |timing: BitTiming| Bounds::of_sure_reception(sample, timing, clock_hz).most_bps;
-        let best = below
-            .flat_map(BitTiming::of_clocks)
-            .map(|timing| BitTiming { jump_width: 1, ..timing })
-            .map(|timing| (timing, failing(timing)))
-            .filter(|(_, share)| *share >= LEAST_SHARE)
-            .map(|(timing, share)| (timing, share, sure(timing)))
-            .max_by(|(.., a), (.., b)| a.total_cmp(b));
-        let Some((timing, share, _)) = best else { return Ok(false) };
-        let frames = (CHANCE.ln() / (1.0 - share.min(0.9)).ln()).ceil() as u32;
-        let heard = self.listen(timing, Purpose::Doubt { frames }, dwell)?;
-        Ok(heard.bounds.most_bps < rate)
-    }
-
-    fn found(&self, bitrate_bps: u32, heard: Heard) -> Option<Outcome> {
-        let timing = self.device.timing(bitrate_bps).ok()?;
-        Some(Outcome::Found { bitrate_bps, timing, frames: heard.frames })
-    }
-}
-
-/// Why a rate is listened to.
-#[derive(Clone, Copy, PartialEq, Eq)]
-enum Purpose {
-    /// Is it this one?
-    Find,
-    /// Is it this one, though not all that is heard is good?
-    Weigh,
-    /// Is it this one rather than the one that was heard?
-    Doubt {
-        /// Good ones that answer yes.
-        frames: u32,
-    },
-    /// It may be near: which frames are heard, and which are not?
-    Study,
 }

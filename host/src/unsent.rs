@@ -215,7 +215,7 @@ pub struct Watch<'d> {
 }
 
 impl<'d> Watch<'d> {
-    /// Watches a device from now on. `recovers` says that somebody brings channels with manual recovery back from bus-off;
+    /// Watches a device from now on. `recovers` says that the caller brings channels with manual recovery back from bus-off;
     /// otherwise such a channel stands still.
     pub fn new(device: &'d Device, recovers: bool) -> Self {
         Self {

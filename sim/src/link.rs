@@ -1,4 +1,4 @@
-//! The emulated device as somebody else's serial port: behind a pseudo-terminal, or behind a reader and a
+//! The emulated device as another program's serial port: behind a pseudo-terminal, or behind a reader and a
 //! writer in this process.
 //!
 //! Emulated time follows the clock on the wall, or a share of it, and never runs ahead of it; under full load it
@@ -36,7 +36,7 @@ pub enum Pace {
 pub struct Manner {
     /// What happens while the client does not read.
     pub pace: Pace,
-    /// Emulated time passes at most this many times as fast as the wall's. A client on a busy machine has more time for
+    /// Emulated time passes at most this many times as fast as the wall clock. A client on a busy machine has more time for
     /// each emulated millisecond if this is small.
     pub speed: f64,
     /// Both channels on one bus.
@@ -80,7 +80,7 @@ const PIECES: usize = 64;
 const READ_WAIT: Duration = Duration::from_millis(50);
 /// How long to wait before looking again at a client that lags.
 const LAG_WAIT: Duration = Duration::from_micros(500);
-/// How far the emulation may lag behind the wall's clock before it gives the difference up.
+/// How far the emulation may lag behind the wall clock before it gives the difference up.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
 
 /// A client's end of the byte stream. Neither direction waits.
@@ -89,7 +89,7 @@ pub trait Client {
     fn receive(&self) -> io::Result<Vec<u8>>;
     /// Takes as many of the bytes as it can and says how many.
     fn deliver(&self, bytes: &[u8]) -> io::Result<usize>;
-    /// Whether somebody has the port open, as of the last [`Self::receive`].
+    /// Whether a program has the port open, as of the last [`Self::receive`].
     fn is_open(&self) -> bool {
         true
     }
@@ -169,7 +169,10 @@ impl Served {
             return;
         }
         for channel in Channel::ALL {
-            let bit = self.rig.bit_cycles(channel);
+            // A pin that is measured needs something to be measured.
+            let watched =
+                self.rig.watches(channel).then(|| BitTime::of_rate(DEFAULT_BITRATE_BPS, CLOCK).cycles(1));
+            let bit = self.rig.bit_cycles(channel).or(watched);
             if bit == self.open[channel.index()] {
                 continue;
             }

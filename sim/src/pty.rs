@@ -23,7 +23,7 @@ pub struct Pty {
 }
 
 impl Pty {
-    /// Opens one, in raw mode before anybody can know its name: a cooked terminal would change bytes and
+    /// Opens one, in raw mode before its name can be known: a cooked terminal would change bytes and
     /// echo them.
     pub fn open() -> io::Result<Self> {
         let pair = openpty(None, None)?;

@@ -149,7 +149,7 @@ impl Rig {
         Ok(())
     }
 
-    /// Runs for `cycles` for a host of somebody else's: returns what the device sent and keeps no books.
+    /// Runs for `cycles` for another program's host: returns what the device sent and keeps no books.
     pub fn run_unbooked(&mut self, cycles: u64) -> Result<Vec<u8>, RigError> {
         self.run_watched(cycles).map(|(bytes, _)| bytes)
     }
@@ -378,6 +378,11 @@ impl Rig {
     pub fn bit_cycles(&self, channel: Channel) -> Option<u64> {
         let controller = &self.machine.board().can.controllers[channel.index()];
         controller.listens().then(|| controller.timing().bit())
+    }
+
+    /// Whether the firmware watches the edges of a channel's receive pin.
+    pub fn watches(&self, channel: Channel) -> bool {
+        self.machine.board().watches(channel.index())
     }
 
     /// Whether a channel's controller takes part in its bus, if only as a listener.

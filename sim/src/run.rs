@@ -63,7 +63,7 @@ pub struct Options {
     /// Channels that are captured and carry traffic.
     pub channels: Vec<Channel>,
     /// Bit rate of both buses, in bit/s. Without, a run takes [`DEFAULT_BITRATE_BPS`], and a device that serves
-    /// somebody else's host has buses at the rate at which that host opens the channel.
+    /// another program's host has buses at the rate at which that host opens the channel.
     pub bitrate_bps: Option<u32>,
     /// The host stops reading for this long, in the middle of the run.
     pub stall: Option<Duration>,

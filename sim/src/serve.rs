@@ -52,7 +52,7 @@ mod terminal {
         Ok(asked)
     }
 
-    /// A terminal, until somebody asks for the end.
+    /// A terminal, until it is asked to end.
     struct UntilAsked {
         pty: Pty,
         asked: Arc<AtomicBool>,

@@ -13,7 +13,7 @@ use cantap_wire::{Channel, Command};
 
 /// The stack's region in `memory.x`, at the start of the core-coupled memory.
 const STACK: u32 = 0x1000_0000;
-const STACK_LEN: usize = 27 * 1024;
+const STACK_LEN: usize = 24 * 1024;
 /// The reset vector of the ROM bootloader, as the emulator has it.
 const ROM_ENTRY: u32 = 0x1FFF_3DA5;
 

@@ -6,11 +6,13 @@ mod common;
 use cantap_emu::bus::{BitTime, Node};
 use cantap_emu::can::MasterReset;
 use cantap_emu::machine::Setup;
+use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, Script, Traffic};
 use cantap_emu::usb_host::Timing;
 use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Mode, TxFrame};
+use cantap_wire::record::LossStage;
 use cantap_wire::{Channel, Command, Event, Frame};
 
 const MEGABIT: u32 = 1_000_000;
@@ -128,4 +130,37 @@ fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
     rig.close(Can2).unwrap();
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
     assert_eq!(rig.ledger.losses(Can2).total(), 0);
+}
+
+/// Where the reset clears the banks, the other channel hears nothing until they are written again: at most one frame long, and what
+/// may be missing is told of.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_reset_that_clears_the_banks_costs_a_full_channel_a_frame_at_most_and_is_told_of() {
+    for (round, bound) in [(0, Bound::Best), (1, Bound::Best), (2, Bound::Worst), (3, Bound::Worst)] {
+        let setup = Setup { master_reset: MasterReset::Most, bound, ..board::setup() };
+        let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
+        rig.connect().unwrap();
+        rig.ask(Command::Open { channel: Can1, config: Some(config(Mode::Normal)) }).unwrap();
+        rig.listen(Can2, MEGABIT).unwrap();
+        // The reset falls elsewhere in the frames each time.
+        let from = rig.now() + round * MS / 71;
+        rig.add_traffic(Can2, MEGABIT, Traffic::new(Kind::Std0, 1, 100.0, from, from + 130 * MS));
+        hold(&mut rig, true);
+        rig.run_for(MS).unwrap();
+        rig.ask(Command::Close { channel: Can1 }).unwrap();
+        rig.run_for(30 * MS).unwrap();
+        rig.close(Can2).unwrap();
+        assert!(rig.ledger.holds(), "round {round}: {:?}", rig.ledger.faults());
+        let losses = rig.ledger.losses(Can2);
+        assert!(losses.controller <= 1 && losses.total() == losses.controller, "round {round}: {losses:?}");
+        let told = rig.events().iter().filter(|(_, event)| {
+            matches!(
+                event,
+                Event::Lost { channel: Can2, stage: LossStage::Controller, count: 0, at_least: true }
+            )
+        });
+        assert_eq!(told.count(), 1, "round {round}");
+        assert!(rig.ledger.delivered_count(Can2) > 2_500, "round {round}");
+    }
 }

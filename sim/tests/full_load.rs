@@ -106,7 +106,7 @@ fn each_row_of_the_earlier_analysers_table_is_carried_at_full_load() {
         rig.run_for(105 * MS).unwrap();
         for channel in Channel::ALL {
             rig.close(channel).unwrap();
-            // 100 ms of back-to-back bits, but for the frame that the end of the traffic cut off.
+            // 100 ms of back-to-back bits, except for the frame that the end of the traffic cut off.
             assert!(
                 (99_800..=100_200).contains(&rig.bus_bits(channel)),
                 "{kind:?}: {}",

@@ -78,7 +78,8 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
         let mut rig = joined_under(bound, &[Can1]);
         saturate(&mut rig, Can2, 280);
         let replayed = replay(&mut rig, &[Can1], load, 0.15).unwrap();
-        let within_us = if bound == Best { 0.8 } else { 1.6 };
+        // At worst, the drain of a frame and the work for the last transmission's end may come one after the other.
+        let within_us = if bound == Best { 0.8 } else { 3.0 };
         hold_times(bound, &format!("beside 100 % at {load} %"), replayed.as_deref(), within_us);
         rig.run_for(100 * MS).unwrap();
         rig.close(Can2).unwrap();
@@ -94,12 +95,19 @@ fn a_replay_keeps_its_spacing_beside_a_full_channel_and_costs_it_nothing() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn two_replays_at_once_keep_their_spacing() {
-    for (bound, load, seconds) in
-        [(Best, 10.0, 0.3), (Best, 30.0, 0.15), (Best, 60.0, 0.15), (Best, 90.0, 0.3), (Worst, 60.0, 0.15)]
-    {
+    for (bound, load, seconds) in [
+        (Best, 10.0, 0.3),
+        (Best, 30.0, 0.15),
+        (Best, 60.0, 0.15),
+        (Best, 90.0, 0.3),
+        (Worst, 60.0, 0.15),
+        (Worst, 98.0, 0.3),
+    ] {
         let mut rig = joined_under(bound, &[Can1, Can2]);
         let replayed = replay(&mut rig, &[Can1, Can2], load, seconds).unwrap();
-        hold_times(bound, &format!("both at {load} %"), replayed.as_deref(), 2.0);
+        // At worst, what one channel's end takes is in the other's way where there is 1 µs between frames.
+        let within_us = if bound == Worst && load > 90.0 { 2.5 } else { 2.0 };
+        hold_times(bound, &format!("both at {load} %"), replayed.as_deref(), within_us);
     }
 }
 
@@ -126,6 +134,20 @@ fn two_streams_at_once_fill_both_buses() {
             fill(&mut rig, &[Can1, Can2], Kind::Std8, seconds).unwrap().expect("all frames in order");
         eprintln!("{bound}: {filled:?}");
         assert!(filled.iter().all(|one| one.load_percent >= 99.0), "{bound}: {filled:?}");
+    }
+}
+
+/// The most frames and confirmations that there can be: 20 833 a second of each on each channel.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn two_streams_of_frames_without_data_fill_both_buses() {
+    for (bound, seconds) in [(Best, 0.15), (Worst, 0.3)] {
+        let mut rig = joined_under(bound, &[Can1, Can2]);
+        let filled =
+            fill(&mut rig, &[Can1, Can2], Kind::Std0, seconds).unwrap().expect("all frames in order");
+        eprintln!("{bound}: {filled:?}");
+        assert!(filled.iter().all(|one| one.load_percent >= 99.0), "{bound}: {filled:?}");
+        assert!(filled.iter().all(|one| one.stamps.max_us <= latest_stamp_us(bound)), "{bound}: {filled:?}");
     }
 }
 

@@ -14,12 +14,16 @@
 use stm32f4xx_hal::gpio::{GpioExt, PC1, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Led, Leds, Ports, fast};
+use super::{Led, Leds, Port, Ports, ReceivePin, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "feather-f405";
 /// Crystal, in MHz.
 pub const HSE_MHZ: u32 = 12;
+
+/// Each channel's RX.
+pub const RECEIVE_PINS: [ReceivePin; 2] =
+    [ReceivePin { port: Port::B, pin: 8 }, ReceivePin { port: Port::B, pin: 12 }];
 
 /// Connects pins and peripherals.
 pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {

@@ -9,11 +9,11 @@ mod olimex_p405;
 mod stm32f4_discovery;
 
 #[cfg(feature = "feather-f405")]
-pub use feather_f405::{HSE_MHZ, NAME, connect, leds};
+pub use feather_f405::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
 #[cfg(feature = "olimex-p405")]
-pub use olimex_p405::{HSE_MHZ, NAME, connect, leds};
+pub use olimex_p405::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
 #[cfg(feature = "stm32f4-discovery")]
-pub use stm32f4_discovery::{HSE_MHZ, NAME, connect, leds};
+pub use stm32f4_discovery::{HSE_MHZ, NAME, RECEIVE_PINS, connect, leds};
 
 #[cfg(not(any(feature = "olimex-p405", feature = "feather-f405", feature = "stm32f4-discovery")))]
 compile_error!("choose a board: --features olimex-p405, feather-f405 or stm32f4-discovery");
@@ -32,6 +32,25 @@ pub struct Ports {
     pub c: pac::GPIOC,
     /// Port D.
     pub d: pac::GPIOD,
+}
+
+/// A port that a receive pin is on, by the number that EXTI's sources have for it (RM0090, SYSCFG_EXTICR1).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Port {
+    /// Port B.
+    B = 1,
+    /// Port D.
+    #[cfg(feature = "stm32f4-discovery")]
+    D = 3,
+}
+
+/// A CAN controller's RX pin. Those of both channels have different numbers, since a line of EXTI is one number's of all ports.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ReceivePin {
+    /// The port.
+    pub port: Port,
+    /// 0 to 15.
+    pub pin: u8,
 }
 
 /// A CAN controller's TX pin, whose edges are to take next to nothing of the shortest bit, 1 µs: at the lowest speed, which is the

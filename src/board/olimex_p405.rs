@@ -17,12 +17,16 @@
 use stm32f4xx_hal::gpio::{GpioExt, PC12, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Led, Leds, Ports, fast};
+use super::{Led, Leds, Port, Ports, ReceivePin, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "olimex-p405";
 /// Crystal, in MHz.
 pub const HSE_MHZ: u32 = 8;
+
+/// Each channel's RX.
+pub const RECEIVE_PINS: [ReceivePin; 2] =
+    [ReceivePin { port: Port::B, pin: 8 }, ReceivePin { port: Port::B, pin: 12 }];
 
 /// Connects pins and peripherals.
 pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {

@@ -15,12 +15,16 @@
 use stm32f4xx_hal::gpio::{GpioExt, PD12, PD13, PD14, PinState};
 use stm32f4xx_hal::rcc::Rcc;
 
-use super::{Led, Leds, Ports, fast};
+use super::{Led, Leds, Port, Ports, ReceivePin, fast};
 
 /// Name of the board, as in `Hello`.
 pub const NAME: &str = "stm32f4-discovery";
 /// Crystal, in MHz.
 pub const HSE_MHZ: u32 = 8;
+
+/// Each channel's RX.
+pub const RECEIVE_PINS: [ReceivePin; 2] =
+    [ReceivePin { port: Port::D, pin: 0 }, ReceivePin { port: Port::B, pin: 12 }];
 
 /// Connects pins and peripherals.
 pub fn connect(ports: Ports, rcc: &mut Rcc) -> Leds {

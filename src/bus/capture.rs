@@ -15,7 +15,7 @@ use crate::bus::queue::Producer;
 use crate::bus::recorder::Recorder;
 use crate::bus::sof::SofMark;
 use crate::bus::time::NEVER;
-use crate::bus::transmit::Transmitter;
+use crate::bus::transmit::{Transmitter, TxQueue};
 use crate::lights::Activity;
 use crate::ports::{Clock, Traffic};
 
@@ -23,41 +23,44 @@ use crate::ports::{Clock, Traffic};
 const ALARM_AHEAD_TICKS: u64 = 1 << 30;
 
 /// One channel's state.
-struct ChannelState {
+struct ChannelState<'q> {
     open: Option<ChannelConfig>,
     /// Why its transmissions are aborted, if they are.
     abort_reason: TransmitFailure,
     frames: u32,
     overruns: u32,
     errors: ErrorMonitor,
-    transmitter: Transmitter,
+    transmitter: Transmitter<'q>,
 }
 
 /// Everything the tasks of priority 4 share.
 pub struct Capture<'q, const N: usize = QUEUE_BYTES> {
     recorder: Recorder<'q, N>,
-    channels: [ChannelState; CHANNELS],
+    channels: [ChannelState<'q>; CHANNELS],
+    /// For when the alarm is set, with how early it is; [`NEVER`] if it is off.
+    alarm: u64,
     /// Per channel, frames and mishaps at the last [`Self::take_activity`].
     seen: [(u32, u32); CHANNELS],
 }
 
 impl<'q, const N: usize> Capture<'q, N> {
-    /// Both channels closed.
-    #[expect(clippy::large_stack_arrays, reason = "built once, at start, into its static place")]
-    pub const fn new(producer: Producer<'q, N>) -> Self {
-        const fn state(channel: Channel) -> ChannelState {
+    /// Both channels closed, with the memory of their queues.
+    pub const fn new(producer: Producer<'q, N>, queues: &'q mut [TxQueue; CHANNELS]) -> Self {
+        const fn state(channel: Channel, queue: &mut TxQueue) -> ChannelState<'_> {
             ChannelState {
                 open: None,
                 abort_reason: TransmitFailure::Aborted,
                 frames: 0,
                 overruns: 0,
                 errors: ErrorMonitor::new(channel),
-                transmitter: Transmitter::new(channel),
+                transmitter: Transmitter::new(channel, queue),
             }
         }
+        let [first, second] = queues;
         Self {
             recorder: Recorder::new(producer),
-            channels: [state(Channel::Can1), state(Channel::Can2)],
+            channels: [state(Channel::Can1, first), state(Channel::Can2, second)],
+            alarm: NEVER,
             seen: [(0, 0); CHANNELS],
         }
     }
@@ -117,20 +120,22 @@ impl<'q, const N: usize> Capture<'q, N> {
         }
     }
 
-    /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else.
+    /// A mailbox has finished. `entered` is the clock, read by the transmit interrupt before anything else; `None` if what it came for
+    /// was collected meanwhile, by whoever waited at this priority.
     pub fn on_transmit<T: Traffic, C: Clock>(
         &mut self,
         channel: Channel,
         traffic: &mut [T; CHANNELS],
         clock: &C,
-        entered: u32,
+        entered: Option<u32>,
     ) {
-        let ended = self.recorder.time(entered);
+        let ended = if let Some(entered) = entered {
+            self.collect(channel, &mut traffic[channel.index()], clock, entered)
+        } else {
+            traffic[channel.index()].await_finished();
+            self.recorder.time(clock.now())
+        };
         let patience = ended + Self::patience_ticks::<C>();
-        let Self { recorder, channels, .. } = self;
-        let state = &mut channels[channel.index()];
-        let now = || recorder.time(clock.now());
-        state.transmitter.collect(&mut traffic[channel.index()], state.abort_reason, ended, now);
         // On a busy bus the next frame is due at once: recording first, or leaving for the alarm, would cost more time
         // than there is.
         self.load_in_time(traffic, clock, patience);
@@ -145,6 +150,31 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
+    /// While this waits, what ends is not to wait for its own task: the transmission after it would find no interrupt that stamps it.
+    fn collect_stamped<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+        for channel in Channel::ALL {
+            if let Some(stamp) = traffic[channel.index()].stamped() {
+                self.collect(channel, &mut traffic[channel.index()], clock, stamp);
+            }
+        }
+    }
+
+    /// Empties the mailboxes that have finished, so that the interrupt can stamp the next. Returns the time of the stamp.
+    fn collect(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+        stamp: u32,
+    ) -> u64 {
+        let ended = self.recorder.time(stamp);
+        let Self { recorder, channels, .. } = self;
+        let state = &mut channels[channel.index()];
+        let now = || recorder.time(clock.now());
+        state.transmitter.collect(traffic, state.abort_reason, ended, now);
+        ended
+    }
+
     /// For this long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
     /// for, and one that is due soon after it on the other channel, leave in time. For what is due later the alarm is set
     /// again, which takes less than half that time: the tasks that drain the FIFOs come before it.
@@ -155,33 +185,68 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it: until `patience`
     /// ends, and after that only from one frame to the next while they are half an early alarm apart; the mailboxes take six. All
     /// but the request itself is done ahead, so that two frames due at one moment leave at one moment.
+    #[inline]
     fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, patience: u64) {
-        let early = u64::from(C::ALARM_EARLY_TICKS);
+        let heads = self.due(Transmitter::head_due);
+        // As a rule the mailboxes have just been filled.
+        if heads.iter().any(|&at| at != NEVER) {
+            self.load_heads(traffic, clock, patience, heads);
+        }
+    }
+
+    /// The rest of [`Self::load_in_time`], with when the queues' heads are due.
+    #[inline(never)]
+    fn load_heads<T: Traffic, C: Clock>(
+        &mut self,
+        traffic: &mut [T; CHANNELS],
+        clock: &C,
+        patience: u64,
+        mut heads: [u64; CHANNELS],
+    ) {
+        let early = C::ALARM_EARLY_TICKS;
         loop {
             let now = self.recorder.time(clock.now());
-            let heads = self.due(Transmitter::head_due);
-            let next = heads[0].min(heads[1]);
-            if next > (now + early).min(patience).max(now + early / 2) {
+            if heads.iter().all(|&at| at == 0 || at == NEVER) {
+                // Without a time: nothing is to be waited for.
+                for ((state, traffic), at) in self.channels.iter_mut().zip(traffic).zip(heads) {
+                    if at == 0 {
+                        state.transmitter.load_due(traffic, now);
+                    }
+                }
+                return;
+            }
+            // From now on, 0 if it has passed: 32 bits are half the work.
+            let ahead = |at: u64| u32::try_from(at.saturating_sub(now)).unwrap_or(u32::MAX);
+            let [first, second] = heads.map(ahead);
+            let next = first.min(second);
+            if next > early.min(ahead(patience)).max(early / 2) {
                 return;
             }
             // What is due soon after it would find no time for this between the two. A periodic frame is not waited past; one that
             // is due already is no matter of waiting.
-            let periodic = self.due(Transmitter::periodic_due).into_iter().filter(|due| *due > now).min();
-            let until = (next.max(now) + early / 2).min(periodic.unwrap_or(NEVER));
+            let periodic = self.due(Transmitter::periodic_due).map(ahead);
+            let periodic = periodic.into_iter().filter(|ahead| *ahead > 0).min().unwrap_or(u32::MAX);
+            let until = (next + early / 2).min(periodic);
             let mut mailboxes = [None; CHANNELS];
-            for (channel, mailbox) in mailboxes.iter_mut().enumerate() {
-                if heads[channel] <= until {
+            for (channel, ahead) in [first, second].into_iter().enumerate() {
+                if ahead <= until {
                     let transmitter = &mut self.channels[channel].transmitter;
-                    *mailbox = transmitter.prepare_head(&mut traffic[channel], now.max(heads[channel]));
+                    mailboxes[channel] =
+                        transmitter.prepare_head(&mut traffic[channel], now.max(heads[channel]));
                 }
             }
-            if mailboxes == [None; CHANNELS] {
+            if mailboxes.iter().all(Option::is_none) {
                 return;
             }
-            for channel in if heads[0] <= heads[1] { [0, 1] } else { [1, 0] } {
+            for channel in if first <= second { [0, 1] } else { [1, 0] } {
                 let Some(mailbox) = mailboxes[channel] else { continue };
                 if heads[channel] > now {
-                    clock.wait_until(heads[channel] as u32);
+                    let at = heads[channel] as u32;
+                    // For both channels that takes 4 µs at worst.
+                    if at.wrapping_sub(clock.now()) as i32 > (early / 3) as i32 {
+                        self.collect_stamped(traffic, clock);
+                    }
+                    clock.wait_until(at);
                 }
                 traffic[channel].request(mailbox);
             }
@@ -189,6 +254,10 @@ impl<'q, const N: usize> Capture<'q, N> {
                 if let Some(mailbox) = mailbox {
                     state.transmitter.requested(mailbox);
                 }
+            }
+            heads = self.due(Transmitter::head_due);
+            if heads.iter().all(|&at| at == NEVER) {
+                return;
             }
         }
     }
@@ -257,7 +326,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait.
     fn give_up_when_off(
-        state: &mut ChannelState,
+        state: &mut ChannelState<'_>,
         traffic: &mut impl Traffic,
         recorder: &mut Recorder<'_, N>,
         now: u64,
@@ -274,7 +343,7 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// When something is due on each open channel; [`NEVER`] on the others.
     #[inline]
-    fn due(&self, of: impl Fn(&Transmitter) -> u64) -> [u64; CHANNELS] {
+    fn due(&self, of: impl Fn(&Transmitter<'q>) -> u64) -> [u64; CHANNELS] {
         self.channels
             .each_ref()
             .map(|state| if state.open.is_some() { of(&state.transmitter) } else { NEVER })
@@ -282,12 +351,24 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// Sets the alarm for what is due next.
     pub fn arm<C: Clock>(&mut self, clock: &C) {
-        let now = self.recorder.time(clock.now());
         let [first, second] = self.due(Transmitter::next_due);
         let next = first.min(second);
+        if next == NEVER {
+            if self.alarm != NEVER {
+                self.alarm = NEVER;
+                clock.set_alarm(None);
+            }
+            return;
+        }
+        let now = self.recorder.time(clock.now());
         let early = next.saturating_sub(u64::from(C::ALARM_EARLY_TICKS));
         // Not earlier than now: a time that has passed for long would look like one that is far ahead.
-        clock.set_alarm((next != NEVER).then(|| early.clamp(now, now + ALARM_AHEAD_TICKS) as u32));
+        let at = early.clamp(now, now + ALARM_AHEAD_TICKS);
+        // One that is still to come stands already.
+        if at != self.alarm || at <= now {
+            self.alarm = at;
+            clock.set_alarm(Some(at as u32));
+        }
     }
 
     /// The 64-bit time now.
@@ -320,6 +401,13 @@ impl<'q, const N: usize> Capture<'q, N> {
         state.abort_reason = TransmitFailure::Aborted;
         state.errors.restart();
         self.recorder.event(&Event::Started { channel }, now);
+    }
+
+    /// The channel's filters let nothing pass for a moment. What came then is not even counted by the controller.
+    pub fn was_deaf(&mut self, channel: Channel, clock: &impl Clock) {
+        let now = self.now(clock);
+        let lost = Event::Lost { channel, stage: LossStage::Controller, count: 0, at_least: true };
+        self.recorder.event(&lost, now);
     }
 
     /// First half of closing: gives up transmissions. The channel is still on the bus.
@@ -386,7 +474,7 @@ impl<'q, const N: usize> Capture<'q, N> {
     }
 
     /// The channel's transmissions; call [`Self::kick`] afterwards.
-    pub const fn transmitter(&mut self, channel: Channel) -> &mut Transmitter {
+    pub const fn transmitter(&mut self, channel: Channel) -> &mut Transmitter<'q> {
         &mut self.channels[channel.index()].transmitter
     }
 

@@ -3,7 +3,7 @@
 //!
 //! An entry that waits is not due again: the bus takes its frame when it can, and no sooner for being asked again. So entries
 //! that cannot leave cost nothing, however short their periods; those that pass meanwhile are counted by arithmetic
-//! when the frame leaves, or when somebody asks. The longest wait goes first: where more is asked for than a bus carries, each
+//! when the frame leaves, or when a host asks. The longest wait goes first: where more is asked for than a bus can carry, each
 //! entry gets its turn.
 
 use cantap_wire::message::{DEVICE_TAG, Modifier, Periodic};

@@ -34,16 +34,41 @@ struct Queued {
     at: u64,
 }
 
+/// A transmission that has ended.
+struct Ended {
+    tag: u32,
+    frame: Frame,
+    /// `None`: it was sent.
+    failure: Option<TransmitFailure>,
+    at: u64,
+}
+
 struct TriggerState {
     entry: Trigger,
     left: Option<u32>,
     waiting: bool,
 }
 
+/// The memory of a channel's queue: eight kilobytes, which are made where they stay and never pass over a stack.
+pub struct TxQueue(Deque<Queued, TX_QUEUE>);
+
+impl TxQueue {
+    /// Nothing in it.
+    pub const fn new() -> Self {
+        Self(Deque::new())
+    }
+}
+
+impl Default for TxQueue {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
 /// One channel's transmissions.
-pub struct Transmitter {
+pub struct Transmitter<'q> {
     channel: Channel,
-    queue: Deque<Queued, TX_QUEUE>,
+    queue: &'q mut Deque<Queued, TX_QUEUE>,
     mailboxes: Mailboxes,
     periodic: PeriodicTable,
     triggers: [Option<TriggerState>; TRIGGER_SLOTS],
@@ -51,7 +76,7 @@ pub struct Transmitter {
     replies_waiting: u8,
     /// Finished and not recorded yet. What finds no room in the queue would break "each one is confirmed", so nothing more
     /// is sent until it is written; what was in the mailboxes by then has room here too.
-    unconfirmed: Deque<(Event, u64), { 2 * MAILBOXES }>,
+    unconfirmed: Deque<Ended, { 2 * MAILBOXES }>,
     /// The queue is being given up, as fast as its records find room.
     dropping: Option<TransmitFailure>,
     /// The controller stays off the bus: no mailbox is filled.
@@ -60,12 +85,12 @@ pub struct Transmitter {
     failed: u32,
 }
 
-impl Transmitter {
-    /// Nothing to send.
-    pub const fn new(channel: Channel) -> Self {
+impl<'q> Transmitter<'q> {
+    /// Nothing to send; `queue` is empty.
+    pub const fn new(channel: Channel, queue: &'q mut TxQueue) -> Self {
         Self {
             channel,
-            queue: Deque::new(),
+            queue: &mut queue.0,
             mailboxes: Mailboxes::new(),
             periodic: PeriodicTable::new(channel),
             triggers: [const { None }; TRIGGER_SLOTS],
@@ -254,21 +279,21 @@ impl Transmitter {
         while !self.unconfirmed.is_full() {
             let Some((mailbox, outcome)) = traffic.take_finished() else { break };
             let Some((tag, frame)) = self.mailboxes.take(mailbox) else { continue };
-            let channel = self.channel;
-            let failed = |reason| Event::TransmitFailed { channel, tag, reason };
-            let event = match outcome {
-                Outcome::Sent => Event::Transmitted { channel, tag, frame },
-                Outcome::ArbitrationLost => failed(TransmitFailure::ArbitrationLost),
-                Outcome::Error => failed(TransmitFailure::BusError),
-                Outcome::Aborted => failed(reason),
+            let failure = match outcome {
+                Outcome::Sent => None,
+                Outcome::ArbitrationLost => Some(TransmitFailure::ArbitrationLost),
+                Outcome::Error => Some(TransmitFailure::BusError),
+                Outcome::Aborted => Some(reason),
             };
-            let counter = if outcome == Outcome::Sent { &mut self.sent } else { &mut self.failed };
+            let counter = if failure.is_none() { &mut self.sent } else { &mut self.failed };
             *counter = counter.wrapping_add(1);
             let at = if first { ended } else { now() };
             first = false;
             // Cannot fail: checked above.
-            let _ = self.unconfirmed.push_back((event, at));
+            let _ = self.unconfirmed.push_back(Ended { tag, frame, failure, at });
         }
+        // Whoever collects: a stamp that stays would be taken for the next one's.
+        traffic.await_finished();
     }
 
     /// Whether something other than the queue's frames is waiting, for [`Self::service`].
@@ -278,7 +303,7 @@ impl Transmitter {
     }
 
     /// Fills free mailboxes with the queue's frames that are due, unless something else goes first.
-    fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
+    pub fn load_due(&mut self, traffic: &mut impl Traffic, now: u64) {
         while self.head_due() <= now
             && let Some(mailbox) = self.prepare_head(traffic, now)
         {
@@ -309,8 +334,13 @@ impl Transmitter {
 
     /// Records what has finished, each at its time; false if the queue has no room for all of it.
     pub fn record<const N: usize>(&mut self, recorder: &mut Recorder<'_, N>) -> bool {
-        while let Some((event, at)) = self.unconfirmed.front() {
-            if !recorder.event(event, *at) {
+        let channel = self.channel;
+        while let Some(&Ended { tag, frame, failure, at }) = self.unconfirmed.front() {
+            let event = match failure {
+                None => Event::Transmitted { channel, tag, frame },
+                Some(reason) => Event::TransmitFailed { channel, tag, reason },
+            };
+            if !recorder.event(&event, at) {
                 return false;
             }
             self.unconfirmed.pop_front();
@@ -373,10 +403,10 @@ impl Transmitter {
     /// if it has no time.
     #[inline]
     pub fn head_due(&self) -> u64 {
-        match self.queue.front() {
-            Some(head) if !self.mailboxes.are_full() => head.at,
-            _ => NEVER,
+        if self.mailboxes.are_full() {
+            return NEVER;
         }
+        self.queue.front().map_or(NEVER, |head| head.at)
     }
 
     /// When the next periodic entry is due, if its frame can leave then.

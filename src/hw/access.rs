@@ -10,6 +10,7 @@ use rtic::Mutex;
 use super::can::{CanControl, CanFilters, CanTraffic};
 use super::chip::BoardChip;
 use super::crc::CrcUnit;
+use super::edges::PinMeter;
 use super::sof::SofLatch;
 use super::stamp::{StampAlarm, StampTimer};
 
@@ -37,6 +38,8 @@ pub struct Controls {
     pub sof: SofLatch,
     /// The CRC unit.
     pub crc: CrcUnit,
+    /// What measures the receive pins.
+    pub meter: PinMeter,
 }
 
 /// Commands' own, and the way to the rest.
@@ -53,6 +56,7 @@ impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
     type Clock = StampAlarm;
     type Filters = CanFilters;
     type Chip = BoardChip;
+    type Meter = PinMeter;
 
     fn with_capture<R>(
         &mut self,
@@ -83,5 +87,9 @@ impl<T: Mutex<T = Tap>> Board<'static, QUEUE_BYTES> for Access<'_, T> {
 
     fn chip(&mut self) -> &mut BoardChip {
         &mut self.controls.chip
+    }
+
+    fn meter(&mut self) -> &mut PinMeter {
+        &mut self.controls.meter
     }
 }

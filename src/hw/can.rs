@@ -6,6 +6,7 @@
 //! overrun would overwrite the newest frame) and it hides which mailbox a confirmation belongs to.
 
 use core::ops::Deref;
+use core::sync::atomic::{AtomicU32, Ordering};
 
 use cantap_firmware::bus::filters::{BANKS, Layout, Shape};
 use cantap_firmware::bus::mailboxes::MAILBOXES;
@@ -38,7 +39,7 @@ pub struct Controllers {
 
 impl Controllers {
     /// Switches both controllers on; they are off the bus and let no frame pass.
-    pub fn new(_: CAN1, _: CAN2, rcc: &mut Rcc) -> Self {
+    pub fn new(_: CAN1, _: CAN2, rcc: &mut Rcc, sent_at: &'static [AtomicU32; CHANNELS]) -> Self {
         CAN1::enable(rcc);
         CAN2::enable(rcc);
         CAN1::reset(rcc);
@@ -48,7 +49,7 @@ impl Controllers {
         // After a reset a controller sleeps.
         control.iter_mut().for_each(Control::stop);
         Self {
-            traffic: blocks.map(CanTraffic::new),
+            traffic: [CanTraffic::new(blocks[0], &sent_at[0]), CanTraffic::new(blocks[1], &sent_at[1])],
             control,
             filters: CanFilters { can1: Registers(CAN1::ptr()) },
             bells: (Bells(()), Bells(())),
@@ -59,6 +60,25 @@ impl Controllers {
 /// Bits of IER: transmit mailbox empty, FIFO 0 message pending (RM0090, CAN_IER).
 const TMEIE: usize = 0;
 const FMPIE0: usize = 1;
+
+/// Bits of TSR (RM0090, CAN_TSR): a byte for each mailbox, and the flags of empty ones.
+mod tsr {
+    pub const MAILBOX_BITS: usize = 8;
+    pub const RQCP: u32 = 1 << 0;
+    pub const TXOK: u32 = 1 << 1;
+    pub const ALST: u32 = 1 << 2;
+    pub const EACH_RQCP: u32 = RQCP | RQCP << MAILBOX_BITS | RQCP << (2 * MAILBOX_BITS);
+    pub const TME_SHIFT: usize = 26;
+}
+
+/// Fields of TIxR (RM0090, CAN_TIxR).
+mod tir {
+    pub const TXRQ: u32 = 1 << 0;
+    pub const RTR: u32 = 1 << 1;
+    pub const IDE: u32 = 1 << 2;
+    pub const EXID_SHIFT: u32 = 3;
+    pub const STID_SHIFT: u32 = 21;
+}
 
 /// A controller's registers.
 #[derive(Clone, Copy)]
@@ -97,20 +117,10 @@ impl<const CAN: usize> Bells<CAN> {
         unsafe { &*block }
     }
 
-    #[inline]
-    fn switch(bit: usize, on: bool) {
-        const PERIPHERALS: usize = 0x4000_0000;
-        const ALIAS: usize = 0x4200_0000;
-        let register = Self::registers().ier().as_ptr() as usize;
-        let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
-        // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
-        unsafe { alias.write_volatile(u32::from(on)) };
-    }
-
     /// Silenced bells are read back, so that the line has fallen before the interrupt returns.
     #[inline]
     fn silence(bit: usize) {
-        Self::switch(bit, false);
+        switch(Self::registers(), bit, false);
         Self::registers().ier().read();
     }
 
@@ -123,20 +133,25 @@ impl<const CAN: usize> Bells<CAN> {
     /// Interrupts again on a frame: at once if one is waiting.
     #[inline]
     pub fn open_receive(&self) {
-        Self::switch(FMPIE0, true);
+        switch(Self::registers(), FMPIE0, true);
     }
 
-    /// Ends the transmit interrupt though a mailbox has finished.
+    /// Ends the transmit interrupt though a mailbox has finished, until [`Traffic::await_finished`].
     #[inline]
     pub fn silence_transmit(&self) {
         Self::silence(TMEIE);
     }
+}
 
-    /// Interrupts again on a finished mailbox: at once if one is waiting.
-    #[inline]
-    pub fn open_transmit(&self) {
-        Self::switch(TMEIE, true);
-    }
+/// Switches an interrupt of a controller through its bit's alias (see [`Bells`]).
+#[inline]
+fn switch(controller: &RegisterBlock, bit: usize, on: bool) {
+    const PERIPHERALS: usize = 0x4000_0000;
+    const ALIAS: usize = 0x4200_0000;
+    let register = controller.ier().as_ptr() as usize;
+    let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
+    // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
+    unsafe { alias.write_volatile(u32::from(on)) };
 }
 
 /// A controller's traffic half. It alone writes TSR, the mailboxes, RF0R, MSR and ESR.
@@ -145,23 +160,36 @@ pub struct CanTraffic {
     /// Per mailbox: the number of the request in it.
     requests: [u32; MAILBOXES],
     next_request: u32,
+    /// Per mailbox: TIxR as it was written, so that the request need not read it.
+    identifiers: [u32; MAILBOXES],
     /// Per mailbox: whether it was asked to be given up.
     aborting: [bool; MAILBOXES],
+    /// When the transmit interrupt last stamped. It holds while that is silent.
+    sent_at: &'static AtomicU32,
 }
 
 impl CanTraffic {
-    const fn new(can: Registers) -> Self {
-        Self { can, requests: [0; MAILBOXES], next_request: 0, aborting: [false; MAILBOXES] }
+    const fn new(can: Registers, sent_at: &'static AtomicU32) -> Self {
+        Self {
+            can,
+            requests: [0; MAILBOXES],
+            next_request: 0,
+            identifiers: [0; MAILBOXES],
+            aborting: [false; MAILBOXES],
+            sent_at,
+        }
     }
 
-    /// The mailbox with the oldest request that has completed.
-    fn oldest_finished(&self) -> Option<usize> {
-        let tsr = self.can.tsr().read();
-        let completed = [tsr.rqcp0().bit(), tsr.rqcp1().bit(), tsr.rqcp2().bit()];
+    /// Of mailboxes that have completed, a flag for each, the one with the oldest request.
+    fn oldest(&self, completed: u32) -> usize {
+        if completed.is_power_of_two() {
+            return completed.trailing_zeros() as usize / tsr::MAILBOX_BITS;
+        }
         // Compared by distance, because the numbers wrap.
         (0..MAILBOXES)
-            .filter(|&mailbox| completed[mailbox])
+            .filter(|mailbox| completed >> (mailbox * tsr::MAILBOX_BITS) & tsr::RQCP != 0)
             .max_by_key(|&mailbox| self.next_request.wrapping_sub(self.requests[mailbox]))
+            .unwrap_or(0)
     }
 }
 
@@ -215,76 +243,91 @@ impl Traffic for CanTraffic {
     }
 
     fn prepare(&mut self, frame: &Frame) -> Option<u8> {
-        let tsr = self.can.tsr().read();
+        let tsr = self.can.tsr().read().bits();
         // A mailbox whose outcome nobody has taken yet is empty, but not free.
-        let free = [
-            tsr.tme0().bit() && tsr.rqcp0().bit_is_clear(),
-            tsr.tme1().bit() && tsr.rqcp1().bit_is_clear(),
-            tsr.tme2().bit() && tsr.rqcp2().bit_is_clear(),
-        ];
-        let number = free.iter().position(|&free| free)?;
+        let number = (0..MAILBOXES).find(|number| {
+            tsr >> (tsr::TME_SHIFT + number) & 1 != 0 && tsr >> (number * tsr::MAILBOX_BITS) & tsr::RQCP == 0
+        })?;
         let mailbox = self.can.tx(number);
-        let data = u64::from_le_bytes(frame.padded_data());
+        let [low, high] = [0, 4].map(|from| {
+            let bytes = frame.padded_data();
+            u32::from_le_bytes([bytes[from], bytes[from + 1], bytes[from + 2], bytes[from + 3]])
+        });
         // Written whole: a stray TGT would replace the last data bytes.
         mailbox.tdtr().write(|w| {
             // SAFETY: a frame's DLC has four bits, as the field.
             unsafe { w.dlc().bits(frame.dlc()) }
         });
-        mailbox.tdlr().write(|w| {
-            // SAFETY: every value is data.
-            unsafe { w.bits(data as u32) }
-        });
-        mailbox.tdhr().write(|w| {
-            // SAFETY: every value is data.
-            unsafe { w.bits((data >> 32) as u32) }
-        });
-        mailbox.tir().write(|w| {
-            let id = frame.id();
-            if id.is_extended() {
-                // SAFETY: an extended identifier has 29 bits: 11 and 18, as the fields.
-                unsafe { w.stid().bits((id.raw() >> 18) as u16).exid().bits(id.raw() & 0x3_FFFF) };
-            } else {
-                // SAFETY: a standard identifier has 11 bits, as the field.
-                unsafe { w.stid().bits(id.raw() as u16) };
-            }
-            w.ide().bit(id.is_extended()).rtr().bit(frame.is_remote())
-        });
+        // What is behind the data is not sent, and a write takes as long as a dozen instructions.
+        if frame.data_len() > 0 {
+            mailbox.tdlr().write(|w| {
+                // SAFETY: every value is data.
+                unsafe { w.bits(low) }
+            });
+        }
+        if frame.data_len() > 4 {
+            mailbox.tdhr().write(|w| {
+                // SAFETY: every value is data.
+                unsafe { w.bits(high) }
+            });
+        }
+        let id = frame.id();
+        let identifier = if id.is_extended() {
+            id.raw() << tir::EXID_SHIFT | tir::IDE
+        } else {
+            id.raw() << tir::STID_SHIFT
+        };
+        let identifier = identifier | if frame.is_remote() { tir::RTR } else { 0 };
+        // SAFETY: an identifier of 11 or 29 bits in its place, and the register's own flags.
+        mailbox.tir().write(|w| unsafe { w.bits(identifier) });
+        self.identifiers[number] = identifier;
         Some(number as u8)
     }
 
     #[inline]
     fn request(&mut self, mailbox: u8) {
         let number = usize::from(mailbox).min(MAILBOXES - 1);
-        self.can.tx(number).tir().modify(|_, w| w.txrq().set_bit());
+        // SAFETY: what `prepare` wrote there, and the register's own flag.
+        self.can.tx(number).tir().write(|w| unsafe { w.bits(self.identifiers[number] | tir::TXRQ) });
         self.requests[number] = self.next_request;
         self.next_request = self.next_request.wrapping_add(1);
         self.aborting[number] = false;
     }
 
+    #[inline]
+    fn stamped(&self) -> Option<u32> {
+        // The interrupt silences itself when it has stamped. Without one that has finished, the stamp is an old one.
+        let finished = self.can.tsr().read().bits() & tsr::EACH_RQCP != 0;
+        let stamped = finished && self.can.ier().read().bits() & 1 << TMEIE == 0;
+        stamped.then(|| self.sent_at.load(Ordering::Relaxed))
+    }
+
+    #[inline]
+    fn await_finished(&mut self) {
+        switch(&self.can, TMEIE, true);
+    }
+
     fn take_finished(&mut self) -> Option<(u8, Outcome)> {
-        let mailbox = self.oldest_finished()?;
-        let tsr = self.can.tsr().read();
-        let (sent, arbitration_lost) = match mailbox {
-            0 => (tsr.txok0().bit(), tsr.alst0().bit()),
-            1 => (tsr.txok1().bit(), tsr.alst1().bit()),
-            _ => (tsr.txok2().bit(), tsr.alst2().bit()),
-        };
-        let outcome = if sent {
+        let tsr = self.can.tsr().read().bits();
+        let completed = tsr & tsr::EACH_RQCP;
+        if completed == 0 {
+            return None;
+        }
+        let mailbox = self.oldest(completed);
+        let flags = tsr >> (mailbox * tsr::MAILBOX_BITS);
+        let outcome = if flags & tsr::TXOK != 0 {
             Outcome::Sent
         } else if self.aborting[mailbox] {
             // Before the flags: they may be of an attempt before.
             Outcome::Aborted
-        } else if arbitration_lost {
+        } else if flags & tsr::ALST != 0 {
             Outcome::ArbitrationLost
         } else {
             Outcome::Error
         };
         // Writing RQCP clears the mailbox's other flags, too.
-        self.can.tsr().write(|w| match mailbox {
-            0 => w.rqcp0().set_bit(),
-            1 => w.rqcp1().set_bit(),
-            _ => w.rqcp2().set_bit(),
-        });
+        // SAFETY: one of the register's own flags.
+        self.can.tsr().write(|w| unsafe { w.bits(tsr::RQCP << (mailbox * tsr::MAILBOX_BITS)) });
         Some((mailbox as u8, outcome))
     }
 
@@ -354,7 +397,7 @@ enum Halt {
     None,
     /// The reset is written; the controller acknowledges it by sleeping.
     Resetting,
-    /// It sleeps no more, and is asked for initialisation mode.
+    /// It no longer sleeps, and is asked for initialisation mode.
     Entering,
 }
 
@@ -443,7 +486,7 @@ pub struct CanFilters {
 }
 
 impl FilterBanks for CanFilters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
         let can = &self.can1;
         let bits = |is: fn(Shape) -> bool| {
             let bit = |(number, bank): (usize, &Option<_>)| {
@@ -476,12 +519,14 @@ impl FilterBanks for CanFilters {
             // SAFETY: as above; all banks lead to FIFO 0.
             can.ffa1r().write(|w| unsafe { w.bits(0) });
         }
+        let mut differed = reshaped;
         for (number, bank) in layout.banks.iter().enumerate().take(BANKS) {
             let Some(bank) = bank else { continue };
             let registers = can.fb(number);
             if registers.fr1().read().bits() == bank.first && registers.fr2().read().bits() == bank.second {
                 continue;
             }
+            differed = true;
             // A bank can only be written while it is off.
             // SAFETY: one bit for each of the 28 banks, no others.
             can.fa1r().modify(|r, w| unsafe { w.bits(r.bits() & !(1 << number)) });
@@ -497,5 +542,6 @@ impl FilterBanks for CanFilters {
             can.fa1r().write(|w| unsafe { w.bits(active) });
             can.fmr().modify(|_, w| w.finit().clear_bit());
         }
+        differed
     }
 }

@@ -12,7 +12,8 @@ use stm32f4xx_hal::pac;
 // Before anything else, memory included: no interrupt may find another program's memory with our vectors, or ours with its
 // vectors. So cortex-m-rt's `set-vtor`, which does not mask, is not enough. The order: mask (PRIMASK, and BASEPRI open),
 // VTOR, then SysTick, SysTick's and PendSV's pending bits, and every interrupt's enable and pending bits (82 of them in three
-// words). cortex-m-rt calls this with the stack set and before memory is initialised.
+// words). cortex-m-rt calls this with the stack set and before memory is initialised, which it does for SRAM only: what of the
+// core-coupled memory begins as zero is made so here.
 global_asm!(
     ".section .text.__pre_init, \"ax\"",
     ".global __pre_init",
@@ -43,6 +44,15 @@ global_asm!(
     "str r2, [r1]",
     "str r2, [r1, #4]",
     "str r2, [r1, #8]",
+    // The memory that `init` shares out (memory.x).
+    "ldr r1, =__sshared_out",
+    "ldr r2, =__eshared_out",
+    "1:",
+    "cmp r1, r2",
+    "bhs 2f",
+    "str r0, [r1], #4",
+    "b 1b",
+    "2:",
     "dsb",
     "isb",
     "bx lr",
@@ -82,7 +92,7 @@ pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Foun
 
 /// Resets every peripheral and switches their clocks off.
 fn reset_peripherals(rcc: &pac::RCC) {
-    // SAFETY: these are bits that the registers have; what they reset is nobody's yet.
+    // SAFETY: these are bits that the registers have; what they reset is not in use yet.
     unsafe {
         rcc.ahb1rstr().write(|w| w.bits(AHB1));
         rcc.ahb2rstr().write(|w| w.bits(AHB2));
@@ -94,7 +104,7 @@ fn reset_peripherals(rcc: &pac::RCC) {
         rcc.ahb3rstr().write(|w| w.bits(0));
         rcc.apb1rstr().write(|w| w.bits(0));
         rcc.apb2rstr().write(|w| w.bits(0));
-        // The stack's memory stays on; everything else is switched on by whoever uses it.
+        // The stack's memory stays on; everything else is switched on where it is used.
         rcc.ahb1enr().write(|w| w.bits(CCM_ENABLED));
         rcc.ahb2enr().write(|w| w.bits(0));
         rcc.ahb3enr().write(|w| w.bits(0));

@@ -18,7 +18,7 @@ static mut LOG: MaybeUninit<FailureLog> = MaybeUninit::uninit();
 
 fn load() -> FailureLog {
     // SAFETY: never initialised, but every value of its words and bytes is valid, and a volatile read takes what is there.
-    // Nobody holds a reference to it.
+    // Nothing holds a reference to it.
     unsafe { addr_of!(LOG).cast::<FailureLog>().read_volatile() }
 }
 

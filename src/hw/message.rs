@@ -14,7 +14,7 @@ static mut MESSAGE: MaybeUninit<u32> = MaybeUninit::uninit();
 
 /// Leaves a message for the next run.
 pub fn leave(message: u32) {
-    // SAFETY: a plain word, written whole and volatile; nobody holds a reference to it.
+    // SAFETY: a plain word, written whole and volatile; nothing holds a reference to it.
     unsafe { addr_of_mut!(MESSAGE).cast::<u32>().write_volatile(message) }
 }
 

@@ -7,6 +7,7 @@ pub mod chip;
 mod clocks;
 mod copy;
 pub mod crc;
+pub mod edges;
 mod entry;
 mod failure;
 mod flash;
@@ -20,8 +21,11 @@ pub mod tick;
 pub mod usb;
 pub mod watchdog;
 
+use core::sync::atomic::AtomicU32;
+
 use cantap_firmware::lights;
 use cantap_firmware::port::command::Identity;
+use cantap_wire::CHANNELS;
 use stm32f4xx_hal::pac;
 use stm32f4xx_hal::prelude::*;
 
@@ -45,6 +49,10 @@ pub struct Hardware {
     pub tick: tick::Tick,
     /// The CRC unit.
     pub crc: crc::CrcUnit,
+    /// What measures the receive pins.
+    pub meter: edges::PinMeter,
+    /// The same, in the pins' interrupts.
+    pub catcher: edges::EdgeCatcher,
     /// The virtual COM port.
     pub usb: usb::UsbPort,
     /// The chip.
@@ -61,8 +69,12 @@ pub struct Hardware {
 /// §7.1.7.3); what a host's software makes of a device that is back at once is another matter.
 const DISCONNECTED_MS: u32 = 10;
 
-/// Sets the board up. To be called once, first of all.
-pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> Hardware {
+/// Sets the board up. To be called once, first of all. `sent_at` is where the transmit interrupts leave their stamps.
+pub fn start(
+    device: pac::Peripherals,
+    usb_memory: &'static mut usb::Memory,
+    sent_at: &'static [AtomicU32; CHANNELS],
+) -> Hardware {
     let restarted_after_failure = restart::begin(&device.RCC, &device.SYSCFG);
     let found = entry::restore(&device.RCC, &device.SYSCFG, &device.FLASH);
     restart::forget_reset_cause(&device.RCC);
@@ -82,12 +94,15 @@ pub fn start(device: pac::Peripherals, usb_memory: &'static mut usb::Memory) -> 
     let sensors = sensors::Sensors::start(device.ADC1, &device.ADC_COMMON, &mut rcc);
     stay_in_reach_of_a_debugger(&device.DBGMCU);
     let alarm = stamp::StampTimer::start(device.TIM2, &mut rcc);
+    let (meter, catcher) = edges::PinMeter::new(device.EXTI, device.SYSCFG, alarm.timer(), &mut rcc);
     Hardware {
-        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc),
+        can: can::Controllers::new(device.CAN1, device.CAN2, &mut rcc, sent_at),
         sof: sof::SofLatch::start(alarm.timer()),
         alarm,
         tick: tick::Tick::start(device.TIM7, &mut rcc),
         crc: crc::CrcUnit::start(device.CRC, &mut rcc),
+        meter,
+        catcher,
         usb: usb::UsbPort::new(usb, &mut rcc, &serial, usb_memory),
         chip: chip::BoardChip::new(sensors, flash::LastSector::new(device.FLASH), leds),
         watchdog,

@@ -5,7 +5,7 @@ use cantap_wire::{CHANNELS, Channel};
 
 use crate::bus::capture::Capture;
 use crate::bus::sof::SofReading;
-use crate::ports::{Chip, Clock, Control, FilterBanks, Traffic};
+use crate::ports::{Chip, Clock, Control, EdgeMeter, FilterBanks, Traffic};
 
 /// All of the hardware, and the way to the buses' state.
 pub trait Board<'q, const N: usize> {
@@ -19,6 +19,8 @@ pub trait Board<'q, const N: usize> {
     type Filters: FilterBanks;
     /// The chip.
     type Chip: Chip;
+    /// What measures receive pins.
+    type Meter: EdgeMeter;
 
     /// Lets `act` touch what the tasks of priority 4 own. It holds them up meanwhile, so `act` must be short: frames wait in the
     /// FIFOs, and what is due leaves late. Stamps are taken at a higher priority and do not wait.
@@ -40,6 +42,8 @@ pub trait Board<'q, const N: usize> {
     fn filters(&mut self) -> &mut Self::Filters;
     /// The chip.
     fn chip(&mut self) -> &mut Self::Chip;
+    /// What measures receive pins.
+    fn meter(&mut self) -> &mut Self::Meter;
 
     /// Whether a channel is open.
     fn is_open(&mut self, channel: Channel) -> bool {

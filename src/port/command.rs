@@ -10,12 +10,14 @@ use crate::bus::filters::{BANKS, Layout};
 use crate::bus::periodic::PERIODIC_SLOTS;
 use crate::bus::transmit::{TRIGGER_SLOTS, TX_QUEUE};
 use crate::port::board::Board;
-use crate::ports::{Chip, Control, FilterBanks};
+use crate::ports::{Chip, Control, EdgeMeter, FilterBanks};
 use crate::{CAN_CLOCK_HZ, QUEUE_BYTES, TICK_HZ, TICKS_PER_MS};
 
+mod measuring;
 mod sending;
 mod settings;
 
+use measuring::Measuring;
 pub use sending::send;
 use sending::{set_periodic, set_trigger};
 pub use settings::MAX_SAVED;
@@ -74,6 +76,8 @@ pub struct Commands {
     settings: [ChannelSettings; CHANNELS],
     /// Controllers that are being made to leave their bus.
     halting: [bool; CHANNELS],
+    /// The receive pin that is watched.
+    measuring: Option<Measuring>,
     /// When the work under way was begun.
     begun: u32,
     /// Requests that could not be read.
@@ -89,6 +93,7 @@ impl Commands {
             layout: Layout::open(),
             settings: [NOTHING; CHANNELS],
             halting: [false; CHANNELS],
+            measuring: None,
             begun: 0,
             bad_requests: 0,
         }
@@ -114,7 +119,8 @@ impl Commands {
                 | capability::TIMED_TRANSMIT
                 | capability::SLCAN
                 | capability::DEFAULTS
-                | capability::BOOTLOADER,
+                | capability::BOOTLOADER
+                | capability::EDGES,
         }
     }
 
@@ -162,6 +168,8 @@ impl Commands {
                 Reply::Defaults(saved(channel, board).ok_or(Refusal::NothingSaved)?)
             }
             Command::Failures => Reply::Failures(board.chip().failures()),
+            Command::MeasureEdges { channel } => measuring::measure(&mut self.measuring, channel, board)?,
+            Command::Edges => measuring::edges(&mut self.measuring, board)?,
         };
         Ok(Step::Done(reply))
     }
@@ -169,6 +177,7 @@ impl Commands {
     /// Begins work that the session looks after.
     pub fn begin<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) -> Step {
         self.begun = board.now();
+        self.end_measurement(work, board);
         match work {
             Work::Silence => {
                 for channel in Channel::ALL {
@@ -192,6 +201,18 @@ impl Commands {
             Work::Restart | Work::Bootloader => {}
         }
         Step::Begun(work)
+    }
+
+    /// Whatever ends the session ends a measurement, and so does the opening of its channel.
+    fn end_measurement<'q, const N: usize>(&mut self, work: Work, board: &mut impl Board<'q, N>) {
+        let ends = match work {
+            Work::Open(channel, _) => self.measuring.is_some_and(|measuring| measuring.channel == channel),
+            Work::Close(_) | Work::Recover(_) => false,
+            Work::Silence | Work::Retreat | Work::Restart | Work::Bootloader => true,
+        };
+        if ends && self.measuring.take().is_some() {
+            board.meter().watch(None);
+        }
     }
 
     /// Looks after work: its result when it is done, `None` while it is under way.
@@ -267,12 +288,16 @@ impl Commands {
     ) -> Option<Result<(), Refusal>> {
         let halting = &mut self.halting[channel.index()];
         if !board.control(channel).is_stopped() && waited > STOP_WITHIN_TICKS {
-            *halting = true;
             board.control(channel).halt();
+            // Right behind the reset, because the other channel may hear nothing until then.
+            if !core::mem::replace(halting, true) {
+                self.restore_filters(channel, board);
+            }
         }
+        let halting = &mut self.halting[channel.index()];
         if board.control(channel).is_stopped() {
             if core::mem::take(halting) {
-                board.filters().write(&self.layout);
+                self.restore_filters(channel, board);
             }
             return Some(Ok(()));
         }
@@ -281,6 +306,19 @@ impl Commands {
             *halting = false;
             Err(Refusal::Hardware)
         })
+    }
+
+    /// A channel's controller was reset. If that took the filters with it, another open channel may have missed frames: nobody
+    /// knows how many.
+    fn restore_filters<'q, const N: usize>(&self, channel: Channel, board: &mut impl Board<'q, N>) {
+        if !board.filters().write(&self.layout) {
+            return;
+        }
+        for other in Channel::ALL {
+            if other != channel && board.is_open(other) {
+                board.with_capture(|capture, _, clock| capture.was_deaf(other, clock));
+            }
+        }
     }
 
     /// As [`Self::leave`]; a channel that was open has said its last word too.

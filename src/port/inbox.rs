@@ -85,7 +85,7 @@ impl Inbox {
     /// no `end` yet; `Some(None)` if something longer than `max` was thrown away.
     pub fn take_until<R>(&mut self, end: u8, max: usize, read: impl FnOnce(&[u8]) -> R) -> Option<Option<R>> {
         let searched = if self.searched.0 == end { self.searched.1 } else { 0 };
-        let Some(at) = self.unread()[searched..].iter().position(|&byte| byte == end) else {
+        let Some(at) = position(&self.unread()[searched..], end) else {
             self.searched = (end, self.unread().len());
             if self.unread().len() > max {
                 self.skipping = true;
@@ -106,6 +106,21 @@ impl Default for Inbox {
     fn default() -> Self {
         Self::new()
     }
+}
+
+/// Where a byte stands first: four are looked at in one go.
+fn position(bytes: &[u8], wanted: u8) -> Option<usize> {
+    let (words, rest) = bytes.as_chunks::<4>();
+    for (index, word) in words.iter().enumerate() {
+        let word = u32::from_le_bytes(*word) ^ u32::from_le_bytes([wanted; 4]);
+        // The lowest bit 7 that is set belongs to the first byte that is zero: subtracting 1 borrows there first.
+        let found = word.wrapping_sub(0x0101_0101) & !word & 0x8080_8080;
+        if found != 0 {
+            return Some(4 * index + found.trailing_zeros() as usize / 8);
+        }
+    }
+    let at = rest.iter().position(|&byte| byte == wanted)?;
+    Some(4 * words.len() + at)
 }
 
 #[cfg(test)]
@@ -130,6 +145,21 @@ mod tests {
         take(&mut inbox, 998);
         take(&mut inbox, 999);
         assert_eq!(inbox.first(), None);
+    }
+
+    #[test]
+    fn the_first_of_a_byte_is_found_wherever_it_lies() {
+        let mut random = fastrand::Rng::with_seed(3);
+        for _ in 0..20_000 {
+            let bytes: Vec<u8> = (0..random.usize(..12)).map(|_| random.u8(..) & 0x81).collect();
+            for wanted in [0, 1, 0x80] {
+                assert_eq!(
+                    position(&bytes, wanted),
+                    bytes.iter().position(|&byte| byte == wanted),
+                    "{bytes:?}"
+                );
+            }
+        }
     }
 
     #[test]

@@ -3,7 +3,7 @@
 //! The port speaks two languages. A first byte of 0 means the native protocol, a letter means slcan.
 //! Runs below the tasks of priority 4, in the USB interrupt and the millisecond tick; nothing waits.
 
-use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal};
+use cantap_wire::framing::{MAX_REQUEST, max_encoded_len, unseal_with};
 use cantap_wire::message::{EndReason, read_send, why_unreadable};
 use cantap_wire::{Command, Refusal, Reply, Request};
 
@@ -55,42 +55,73 @@ enum Slept {
     Since(u64),
 }
 
-/// Everything between the record queue and the port.
-pub struct Session<'q, const N: usize = QUEUE_BYTES> {
-    queue: Consumer<'q, N>,
+/// The memory of a session: a dozen kilobytes, which are made where they stay and never pass over a stack.
+pub struct Memory {
     sender: Sender,
-    slcan: Slcan,
-    commands: Commands,
     inbox: Inbox,
     outbox: Outbox,
-    language: Language,
-    work: Option<(Work, Origin)>,
-    /// The host put the bus to sleep with the port open.
-    slept: Slept,
     answers: Answers,
-    marks: SofMarks,
     /// The request being handled, and the packet being read: kept here, because clearing them on the stack takes time.
     request: [u8; MAX_REQUEST_ENCODED],
     packet: [u8; PACKET],
 }
 
-impl<'q, const N: usize> Session<'q, N> {
-    /// No host yet.
-    pub const fn new(queue: Consumer<'q, N>, identity: Identity) -> Self {
+impl Memory {
+    /// Nothing in it.
+    pub const fn new() -> Self {
         Self {
-            queue,
             sender: Sender::new(),
-            slcan: Slcan::new(),
-            commands: Commands::new(identity),
             inbox: Inbox::new(),
             outbox: Outbox::new(),
+            answers: Answers::new(),
+            request: [0; MAX_REQUEST_ENCODED],
+            packet: [0; PACKET],
+        }
+    }
+}
+
+impl Default for Memory {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+/// Everything between the record queue and the port.
+pub struct Session<'q, const N: usize = QUEUE_BYTES> {
+    queue: Consumer<'q, N>,
+    sender: &'q mut Sender,
+    slcan: Slcan,
+    commands: Commands,
+    inbox: &'q mut Inbox,
+    outbox: &'q mut Outbox,
+    language: Language,
+    work: Option<(Work, Origin)>,
+    /// The host put the bus to sleep with the port open.
+    slept: Slept,
+    answers: &'q mut Answers,
+    marks: SofMarks,
+    request: &'q mut [u8; MAX_REQUEST_ENCODED],
+    packet: &'q mut [u8; PACKET],
+}
+
+impl<'q, const N: usize> Session<'q, N> {
+    /// No host yet.
+    pub const fn new(queue: Consumer<'q, N>, identity: Identity, memory: &'q mut Memory) -> Self {
+        let Memory { sender, inbox, outbox, answers, request, packet } = memory;
+        Self {
+            queue,
+            sender,
+            slcan: Slcan::new(),
+            commands: Commands::new(identity),
+            inbox,
+            outbox,
             language: Language::Unknown,
             work: None,
             slept: Slept::No,
-            answers: Answers::new(),
+            answers,
             marks: SofMarks::new(),
-            request: [0; MAX_REQUEST_ENCODED],
-            packet: [0; PACKET],
+            request,
+            packet,
         }
     }
 
@@ -159,7 +190,7 @@ impl<'q, const N: usize> Session<'q, N> {
     /// The host is gone: the channels leave the bus, and nothing of it remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
         port.hold(false);
-        while port.read(&mut self.packet).is_some() {}
+        while port.read(self.packet).is_some() {}
         if self.is_active() {
             self.language = Language::Unknown;
             self.slept = Slept::No;
@@ -179,7 +210,7 @@ impl<'q, const N: usize> Session<'q, N> {
     fn read(&mut self, port: &mut impl Port) {
         loop {
             self.hold(port);
-            let Some(len) = port.read(&mut self.packet) else { break };
+            let Some(len) = port.read(self.packet) else { break };
             if !self.inbox.push(&self.packet[..len]) {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
             }
@@ -267,8 +298,9 @@ impl<'q, const N: usize> Session<'q, N> {
 
     fn handle_request(&mut self, greeted: bool, board: &mut impl Board<'q, N>) -> bool {
         let Self { inbox, request, .. } = self;
-        let taken =
-            inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| unseal(encoded, request).map(<[u8]>::len));
+        let taken = inbox.take_until(0, MAX_REQUEST_ENCODED, |encoded| {
+            unseal_with(encoded, &mut request[..], |message| board.crc32(message)).map(<[u8]>::len)
+        });
         let Some(len) = taken else { return false };
         let Some(Ok(len)) = len else {
             // Damaged: there is no telling whom to answer.

@@ -20,8 +20,12 @@ use crate::{CAN_CLOCK_HZ, TICKS_PER_MS, TICKS_PER_US};
 
 /// The channel that slcan works on.
 const CHANNEL: Channel = Channel::Can1;
-/// Bit rates of `S0` to `S8`, in bit/s.
-const RATES_BPS: [u32; 9] = [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000];
+/// Bit rates of `S0` to `S9`, in bit/s. Lawicel's manual ends with `S8`; python-can means 83.3 kbit/s by `S9`.
+const RATES_BPS: [u32; 10] =
+    [10_000, 20_000, 50_000, 100_000, 125_000, 250_000, 500_000, 800_000, 1_000_000, 83_333];
+/// What python-can means by `S7`. It tells itself apart by the empty line that it sends behind every `S`, in the place of a
+/// data bit rate (python-can 4.5, `interfaces/slcan.py`).
+const S7_OF_PYTHON_CAN_BPS: u32 = 750_000;
 /// Clock that the registers of `s` count: an SJA1000 with 16 MHz, which it halves.
 const SJA1000_HZ: u32 = 8_000_000;
 /// Stamps of `Z1` wrap after a minute.
@@ -65,10 +69,29 @@ enum Stamps {
     Microseconds,
 }
 
+/// The bit rate that the host asked for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Rate {
+    /// None: the saved one counts.
+    Unset,
+    /// One that is not to be had. Few programs look at the answers: nothing is opened at a rate that was not asked for.
+    Refused,
+    Set(BitTiming),
+}
+
+impl Rate {
+    /// What an `S` asks for, if there is such a timing.
+    fn of(bitrate_bps: u32) -> Option<Self> {
+        BitTiming::choose(CAN_CLOCK_HZ, bitrate_bps, None).ok().map(Self::Set)
+    }
+}
+
 /// The slcan side of a session.
 pub struct Slcan {
     answer: Option<Answer>,
-    timing: Option<BitTiming>,
+    rate: Rate,
+    /// The last line was `S7`.
+    is_seven: bool,
     stamps: Stamps,
     /// Frames are sent as they come (`X1`), rather than on `P` and `A`. On from the start, as
     /// python-can and slcand expect.
@@ -84,7 +107,7 @@ pub struct Slcan {
     flags: u8,
     /// Losses, errors and states are lines (`K1`).
     reports: bool,
-    /// A frame was refused for want of room, which is still to be reported.
+    /// A frame was refused because there was no room, which is still to be reported.
     refused_frame: bool,
     tag: u32,
     running_ticks: u64,
@@ -100,7 +123,8 @@ impl Slcan {
     pub const fn new() -> Self {
         Self {
             answer: None,
-            timing: None,
+            rate: Rate::Unset,
+            is_seven: false,
             stamps: Stamps::Off,
             auto_poll: true,
             polled: 0,
@@ -162,7 +186,11 @@ impl Slcan {
     ) -> Option<Work> {
         // Empty lines are answered, since hosts send them to synchronise.
         let line = line.trim_ascii();
+        let was_seven = core::mem::take(&mut self.is_seven);
         let Some((&letter, parameters)) = line.split_first() else {
+            if was_seven {
+                self.rate = Rate::of(S7_OF_PYTHON_CAN_BPS).unwrap_or(Rate::Refused);
+            }
             self.answer = Some(Answer::Ok);
             return None;
         };
@@ -187,13 +215,18 @@ impl Slcan {
         let open = config.is_some();
         let ok = Done::Answer(Answer::Ok);
         match (letter, parameters) {
-            (b'S', &[digit @ b'0'..=b'8']) if !open => {
-                let rate = RATES_BPS[usize::from(digit - b'0')];
-                self.timing = Some(BitTiming::choose(CAN_CLOCK_HZ, rate, None).ok()?);
-                Some(ok)
-            }
-            (b's', parameters) if !open && parameters.len() == 4 => {
-                self.timing = Some(timing_of_sja1000(hex(parameters)? as u16)?);
+            (b'S' | b's', parameters) if !open => {
+                self.rate = Rate::Refused;
+                self.rate = match (letter, parameters) {
+                    (b'S', &[digit @ b'0'..=b'9']) => {
+                        self.is_seven = digit == b'7';
+                        Rate::of(RATES_BPS[usize::from(digit - b'0')])?
+                    }
+                    (b's', registers) if registers.len() == 4 => {
+                        Rate::Set(timing_of_sja1000(hex(registers)? as u16)?)
+                    }
+                    _ => return None,
+                };
                 Some(ok)
             }
             (b'O', []) if !open => self.open(Mode::Normal, commands, board),
@@ -276,8 +309,12 @@ impl Slcan {
         commands: &mut Commands,
         board: &mut impl Board<'q, N>,
     ) -> Option<Done> {
-        let saved = commands.config_or_saved(CHANNEL, board).map(|config| config.timing);
-        let config = ChannelConfig { mode, ..ChannelConfig::listen_only(self.timing.or(saved)?) };
+        let timing = match self.rate {
+            Rate::Set(timing) => timing,
+            Rate::Refused => return None,
+            Rate::Unset => commands.config_or_saved(CHANNEL, board)?.timing,
+        };
+        let config = ChannelConfig { mode, ..ChannelConfig::listen_only(timing) };
         self.flags = 0;
         self.polled = 0;
         run(Command::Open { channel: CHANNEL, config: Some(config) }, commands, board)

@@ -87,6 +87,10 @@ pub fn command() -> impl Strategy<Value = Command> {
     let simple = prop::sample::select(vec![
         Command::Status,
         Command::Failures,
+        Command::Edges,
+        Command::MeasureEdges { channel: None },
+        Command::MeasureEdges { channel: Some(Channel::Can1) },
+        Command::MeasureEdges { channel: Some(Channel::Can2) },
         Command::Time,
         Command::Identify { seconds: 1 },
         Command::SaveDefaults,

@@ -13,7 +13,7 @@ use cantap_firmware::port::board::Board;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::Session;
 use cantap_firmware::ports::{
-    Chip, Clock, Control, ErrorStatus, FilterBanks, Outcome, PACKET, Port, Traffic,
+    Chip, Clock, Control, EdgeMeter, ErrorStatus, FilterBanks, Outcome, PACKET, PinEdge, Port, Traffic,
 };
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{ChannelConfig, EndReason, Failures, Mode, RegisterSet};
@@ -183,11 +183,15 @@ impl Control for FakeControl {
 #[derive(Default)]
 pub struct FakeFilters {
     pub written: Vec<Layout>,
+    /// A controller's reset has cleared the banks.
+    pub cleared: bool,
 }
 
 impl FilterBanks for FakeFilters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
+        let differed = std::mem::take(&mut self.cleared) || self.written.last() != Some(layout);
         self.written.push(layout.clone());
+        differed
     }
 }
 
@@ -283,6 +287,30 @@ impl Port for FakePort {
     }
 }
 
+/// A meter whose edges a test puts there.
+#[derive(Default)]
+pub struct FakeMeter {
+    /// How it was told what to watch.
+    pub watched: Vec<Option<Channel>>,
+    pub edges: VecDeque<PinEdge>,
+    pub dominant: bool,
+}
+
+impl EdgeMeter for FakeMeter {
+    fn watch(&mut self, channel: Option<Channel>) {
+        self.watched.push(channel);
+        self.edges.clear();
+    }
+
+    fn next(&mut self) -> Option<PinEdge> {
+        self.edges.pop_front()
+    }
+
+    fn is_dominant(&self) -> bool {
+        self.dominant
+    }
+}
+
 pub struct FakeBoard<'q, const N: usize> {
     pub capture: Capture<'q, N>,
     pub traffic: [FakeTraffic; CHANNELS],
@@ -292,6 +320,7 @@ pub struct FakeBoard<'q, const N: usize> {
     pub chip: FakeChip,
     /// What the next reading of the SOF latch finds.
     pub sof: Option<SofReading>,
+    pub meter: FakeMeter,
 }
 
 impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
@@ -300,6 +329,7 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
     type Clock = FakeClock;
     type Filters = FakeFilters;
     type Chip = FakeChip;
+    type Meter = FakeMeter;
 
     fn with_capture<R>(
         &mut self,
@@ -327,6 +357,10 @@ impl<'q, const N: usize> Board<'q, N> for FakeBoard<'q, N> {
     fn chip(&mut self) -> &mut FakeChip {
         &mut self.chip
     }
+
+    fn meter(&mut self) -> &mut FakeMeter {
+        &mut self.meter
+    }
 }
 
 /// A device of fakes with a host at its port.
@@ -352,15 +386,16 @@ impl<'q, const N: usize> Bench<'q, N> {
         let identity = Identity { board: "fake", serial: "0123456789ABCDEF".try_into().unwrap() };
         Bench {
             board: FakeBoard {
-                capture: Capture::new(producer),
+                capture: Capture::new(producer, Box::leak(Box::default())),
                 traffic: Default::default(),
                 control: Default::default(),
                 clock: FakeClock::default(),
                 filters: FakeFilters::default(),
                 chip: FakeChip::default(),
                 sof: None,
+                meter: FakeMeter::default(),
             },
-            session: Session::new(consumer, identity),
+            session: Session::new(consumer, identity, Box::leak(Box::default())),
             port: FakePort { open: true, takes: usize::MAX, ..Default::default() },
             decoder: Decoder::new(),
             records: Vec::new(),
@@ -434,7 +469,7 @@ impl<'q, const N: usize> Bench<'q, N> {
     /// The transmit interrupt.
     fn transmit_interrupt(&mut self, channel: Channel) {
         let entered = self.board.clock.now();
-        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, entered);
+        self.board.capture.on_transmit(channel, &mut self.board.traffic, &self.board.clock, Some(entered));
     }
 
     /// A millisecond passes. Mailboxes that were given up have reported that meanwhile.

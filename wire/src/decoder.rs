@@ -24,7 +24,7 @@ pub enum Corruption {
         sequence: u32,
     },
     /// A batch that is older than one already seen. A device never goes back within a session: this one is another's, and
-    /// how many frames are missing nobody can tell.
+    /// how many frames are missing cannot be known.
     OutOfOrder {
         /// Its sequence number.
         sequence: u32,

@@ -104,47 +104,76 @@ pub fn seal_with(
 /// Decodes what is between two zero bytes into `out`, which must be at least as long, and
 /// returns the message without its CRC.
 pub fn unseal<'a>(encoded: &[u8], out: &'a mut [u8]) -> Result<&'a [u8], FramingError> {
+    unseal_with(encoded, out, crc32)
+}
+
+/// The same for who has a faster way to the CRC of a message than [`crc32`].
+pub fn unseal_with<'a>(
+    encoded: &[u8],
+    out: &'a mut [u8],
+    crc32: impl FnOnce(&[u8]) -> u32,
+) -> Result<&'a [u8], FramingError> {
     if out.len() < encoded.len() {
         return Err(FramingError::Cobs);
     }
     let len = decode_cobs(encoded, out).ok_or(FramingError::Cobs)?;
     let body = len.checked_sub(CRC_LEN).ok_or(FramingError::Short)?;
     let (message, crc) = out[..len].split_at(body);
-    if CRC.checksum(message).to_le_bytes() == crc { Ok(message) } else { Err(FramingError::Crc) }
+    if crc32(message).to_le_bytes() == crc { Ok(message) } else { Err(FramingError::Crc) }
 }
 
-/// How many bytes stand before the first zero, or how many there are: four at a time.
-fn before_zero(bytes: &[u8]) -> usize {
-    let (words, rest) = bytes.as_chunks::<4>();
-    for (index, word) in words.iter().enumerate() {
-        let word = u32::from_le_bytes(*word);
-        // The lowest bit 7 that is set belongs to the first byte that is zero: subtracting 1 borrows there first.
-        let zeros = word.wrapping_sub(0x0101_0101) & !word & 0x8080_8080;
-        if zeros != 0 {
-            return 4 * index + zeros.trailing_zeros() as usize / 8;
-        }
-    }
-    let tail = rest.iter().position(|&byte| byte == 0).unwrap_or(rest.len());
-    4 * words.len() + tail
-}
-
-/// Encodes COBS in whole runs, into `out`, which is long enough: `cobs::encode` goes byte by byte, which costs the device a tenth of
-/// its time for USB.
+/// Encodes COBS into `out`, which is long enough. Four bytes are looked through and copied at once: `cobs::encode` goes byte by
+/// byte, which costs the device a tenth of its time for USB.
 fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
     const MAX_RUN: usize = 254;
-    let (mut rest, mut len) = (message, 0);
+    // Where the run's length is to stand, and where its next byte.
+    let (mut code, mut len) = (0, 1);
+    let mut rest = message;
     loop {
-        let most = rest.len().min(MAX_RUN);
-        let run = before_zero(&rest[..most]);
-        out[len] = run as u8 + 1;
-        out[len + 1..][..run].copy_from_slice(&rest[..run]);
-        len += 1 + run;
-        // A full run has no zero behind it; any other has one, or the end.
-        let taken = if run == MAX_RUN { run } else { run + 1 };
-        match rest.get(taken..) {
-            Some(behind) if run < MAX_RUN || !behind.is_empty() => rest = behind,
-            _ => return len,
+        let run = len - code - 1;
+        let zero = if let Some((word, behind)) = rest.split_first_chunk::<4>()
+            && run + 4 <= MAX_RUN
+        {
+            // What is copied behind a zero is written over.
+            out[len..len + 4].copy_from_slice(word);
+            let bytes = u32::from_le_bytes(*word);
+            // The lowest bit 7 that is set belongs to the first byte that is zero: subtracting 1 borrows there first.
+            let zeros = bytes.wrapping_sub(0x0101_0101) & !bytes & 0x8080_8080;
+            if zeros == 0 {
+                len += 4;
+                rest = behind;
+                false
+            } else {
+                let before = zeros.trailing_zeros() as usize / 8;
+                len += before;
+                rest = &rest[before + 1..];
+                true
+            }
+        } else if let Some((&byte, behind)) = rest.split_first() {
+            rest = behind;
+            if byte != 0 {
+                out[len] = byte;
+                len += 1;
+            }
+            byte == 0
+        } else {
+            out[code] = run as u8 + 1;
+            return len;
+        };
+        let run = len - code - 1;
+        if zero {
+            out[code] = run as u8 + 1;
+        } else if run == MAX_RUN {
+            // No zero stands behind a full run, and nothing at all where the message ends with it.
+            out[code] = u8::MAX;
+            if rest.is_empty() {
+                return len;
+            }
+        } else {
+            continue;
         }
+        code = len;
+        len += 1;
     }
 }
 
@@ -152,15 +181,25 @@ fn encode_cobs(message: &[u8], out: &mut [u8]) -> usize {
 fn decode_cobs(mut encoded: &[u8], out: &mut [u8]) -> Option<usize> {
     let mut len = 0;
     while let Some((&code, rest)) = encoded.split_first() {
-        let (run, rest) = rest.split_at_checked(usize::from(code).checked_sub(1)?)?;
-        out.get_mut(len..len + run.len())?.copy_from_slice(run);
-        len += run.len();
+        let run = usize::from(code).checked_sub(1)?;
+        if let Some(eight) = rest.first_chunk::<8>()
+            && run <= 8
+            && let Some(room) = out.get_mut(len..len + 8)
+        {
+            // Where there are many zeros runs are short. What is copied behind the run is written over.
+            room.copy_from_slice(eight);
+            encoded = &rest[run..];
+        } else {
+            let (bytes, rest) = rest.split_at_checked(run)?;
+            out.get_mut(len..len + run)?.copy_from_slice(bytes);
+            encoded = rest;
+        }
+        len += run;
         // Each run but a full one stands for a zero behind it, except at the end.
-        if code != u8::MAX && !rest.is_empty() {
+        if code != u8::MAX && !encoded.is_empty() {
             *out.get_mut(len)? = 0;
             len += 1;
         }
-        encoded = rest;
     }
     Some(len)
 }

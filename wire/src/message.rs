@@ -8,14 +8,18 @@ use crate::{CHANNELS, Channel};
 
 mod bytes;
 mod channel;
+mod edges;
+mod sharing;
 mod status;
 mod transmission;
 
 pub use bytes::{read_send, why_unreadable, write_response};
 pub use channel::{ChannelConfig, Filter, FrameKind, Mode};
+pub use edges::{Edge, Edges, MAX_EDGES};
+pub use sharing::Role;
 pub use status::{ChannelStatus, Failures, MAX_FAILURE_TEXT, RegisterSet, Registers, Status};
 pub use transmission::{
-    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, Periodic, TRIGGER_TAG, Trigger, TxFrame,
+    Checksum, DEVICE_TAG, MAX_MODIFIERS, Modifier, OTHERS_TAG, Periodic, TRIGGER_TAG, Trigger, TxFrame,
 };
 
 /// Most filters that one channel takes; the hardware's banks may be exhausted earlier.
@@ -72,6 +76,10 @@ pub struct SessionEnd {
 pub enum EndReason {
     /// The host suspended the bus, and woke it again without having closed the port.
     Suspended,
+    /// Never from a device: the server of a shared board has lost it.
+    BoardLost,
+    /// Never from a device: the server of a shared board has ended.
+    ServerEnded,
 }
 
 /// The one answer that every request gets.
@@ -184,6 +192,14 @@ pub enum Command {
     },
     /// Asks for [`Failures`]. They stay until the device loses its power.
     Failures,
+    /// Watches the receive pin of a closed channel from now on, in place of any that was watched before; its controller stays off the
+    /// bus. What had been measured is forgotten. It ends when the channel is opened, and with the session.
+    MeasureEdges {
+        /// Which; `None` ends it.
+        channel: Option<Channel>,
+    },
+    /// Asks for the [`Edges`] that were measured since the last answer.
+    Edges,
 }
 
 /// A value that answers a request.
@@ -218,6 +234,8 @@ pub enum Reply {
     Defaults(Defaults),
     /// To [`Command::Failures`].
     Failures(Failures),
+    /// To [`Command::Edges`].
+    Edges(Edges),
 }
 
 /// What is stored for a channel over a power cycle.
@@ -283,6 +301,19 @@ pub enum Refusal {
     NothingSaved,
     /// The controller is not bus-off.
     NotBusOff,
+    /// No receive pin is watched.
+    NotMeasuring,
+    /// Never from a device: the server of a shared board does not let this client do that.
+    NotGranted {
+        /// What it would have to be granted.
+        needs: Role,
+    },
+    /// Never from a device: another client of the server holds the right to configure.
+    Held,
+    /// Never from a device: other clients of the server have the channel open, with another bit timing or mode.
+    OtherSettings,
+    /// Never from a device: the server has no board at the moment.
+    NoBoard,
 }
 
 /// What a device is. The first field's encoding never changes between versions.
@@ -328,4 +359,6 @@ pub mod capability {
     pub const DEFAULTS: u32 = 1 << 3;
     /// Can enter a bootloader.
     pub const BOOTLOADER: u32 = 1 << 4;
+    /// Measures edges of its receive pins.
+    pub const EDGES: u32 = 1 << 5;
 }

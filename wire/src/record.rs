@@ -15,8 +15,8 @@
 pub use cantap_can::{BusErrorKind, ErrorState};
 use serde::{Deserialize, Serialize};
 
-use crate::packed::take_data;
-use crate::varint::take_u32;
+use crate::packed::{put_packed, take_data};
+use crate::varint::{put_u32, take_u32};
 use crate::{Channel, Frame, Id};
 
 /// Bytes of the longest received-frame record: qualifier, header, ID, time difference, data.
@@ -232,10 +232,28 @@ pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECOR
 }
 
 /// Writes an event and returns its length. `ticks` is the time since the record before.
+#[inline]
 pub fn encode_event(event: &Event, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
-    // Cannot fail: the buffer holds the longest event there is (tested below).
-    let len = postcard::to_slice(event, &mut out[..]).map_or(0, |written| written.len());
+    // While a host streams, nearly all events are confirmations.
+    let len = match event {
+        Event::Transmitted { channel, tag, frame } => put_transmitted(*channel, *tag, frame, out),
+        _ => put_event(event, out),
+    };
     len + encode_ticks(ticks, &mut out[len..])
+}
+
+fn put_event(event: &Event, out: &mut [u8]) -> usize {
+    // Cannot fail: the buffer holds the longest event there is (tested below).
+    postcard::to_slice(event, out).map_or(0, |written| written.len())
+}
+
+#[inline]
+fn put_transmitted(channel: Channel, tag: u32, frame: &Frame, out: &mut [u8; MAX_RECORD]) -> usize {
+    out[0] = TRANSMITTED;
+    out[1] = channel.index() as u8;
+    let len = 2 + put_u32(tag, &mut out[2..]);
+    let Some(room) = out[len..].first_chunk_mut() else { return len };
+    len + put_packed(frame, room)
 }
 
 /// postcard's `i64`.
@@ -243,15 +261,7 @@ pub fn encode_event(event: &Event, ticks: i64, out: &mut [u8; MAX_RECORD]) -> us
 fn encode_ticks(ticks: i64, out: &mut [u8]) -> usize {
     // Nearly all there are; and half the registers, on the device.
     let Ok(ticks) = i32::try_from(ticks) else { return encode_long_ticks(ticks, out) };
-    let mut zigzag = ((ticks << 1) ^ (ticks >> 31)) as u32;
-    let mut len = 0;
-    while zigzag >= 0x80 {
-        out[len] = zigzag as u8 | 0x80;
-        zigzag >>= 7;
-        len += 1;
-    }
-    out[len] = zigzag as u8;
-    len + 1
+    put_u32(((ticks << 1) ^ (ticks >> 31)) as u32, out)
 }
 
 #[cold]

@@ -4,6 +4,19 @@
 /// Bytes of the longest `u32`.
 const MAX_U32: usize = 5;
 
+/// Writes a `u32` and returns its length. `out` has room for it.
+#[inline]
+pub(crate) fn put_u32(mut value: u32, out: &mut [u8]) -> usize {
+    let mut len = 0;
+    while value >= 0x80 {
+        out[len] = value as u8 | 0x80;
+        value >>= 7;
+        len += 1;
+    }
+    out[len] = value as u8;
+    len + 1
+}
+
 /// Reads a `u64`, with what follows it.
 #[inline]
 pub(crate) fn take_u64(bytes: &[u8]) -> Option<(u64, &[u8])> {
@@ -72,6 +85,13 @@ mod tests {
         ) {
             prop_assert_eq!(take_u32(&bytes), postcard::take_from_bytes(&bytes).ok());
             prop_assert_eq!(take_u64(&bytes), postcard::take_from_bytes(&bytes).ok());
+        }
+
+        #[test]
+        fn what_is_written_is_what_postcard_writes(value: u32, bits in 0..32u32) {
+            let mut out = [0; MAX_U32];
+            let len = put_u32(value >> bits, &mut out);
+            prop_assert_eq!(&out[..len], &encoded((value >> bits).into())[..]);
         }
     }
 }

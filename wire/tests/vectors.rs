@@ -199,6 +199,7 @@ fn responses() -> Vec<Value> {
             Refusal::Protocol { device } => format!(" {device}"),
             Refusal::QueueFull { free } => format!(" {free}"),
             Refusal::BanksExhausted { needed, available } => format!(" {needed} {available}"),
+            Refusal::NotGranted { needs } => format!(" {}", needs as u8),
             _ => String::new(),
         };
         let reads = format!("response 5 refused {what}{detail}");

@@ -82,6 +82,10 @@ pub fn check(shell: &Shell, toolchain: Toolchain, checks: &[Check]) -> Result<Ou
         let target_dir = workspace::target().join("cross");
         toolchain
             .cargo_for(shell, "check", target, "std,panic_abort", &target_dir)?
+            // A standard library that has to be built is compiled even for a check, but never run: without optimisation, and without
+            // the parts that read debug information for backtraces.
+            .envs([("CARGO_PROFILE_DEV_OPT_LEVEL", "0"), ("CARGO_PROFILE_DEV_DEBUG", "0")])
+            .args(toolchain.std_features())
             .args(*arguments)
             .run()?;
     }

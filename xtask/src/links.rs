@@ -103,7 +103,7 @@ fn anchor(heading: &str) -> String {
     heading.to_lowercase().chars().filter_map(kept).collect()
 }
 
-/// Every page below a folder, but for hidden folders and what is built.
+/// Every page below a folder, except for hidden folders and what is built.
 fn pages_under(folder: &Path) -> Result<Vec<PathBuf>> {
     let mut pages = Vec::new();
     for entry in fs::read_dir(folder)? {

@@ -107,6 +107,14 @@ impl Toolchain {
         Ok(cmd)
     }
 
+    /// What chooses the features of a standard library that is built, where it is: only what an executable cannot do without.
+    pub const fn std_features(self) -> Option<&'static str> {
+        match self {
+            Toolchain::Rustup => None,
+            Toolchain::Debian => Some("-Zbuild-std-features=panic-unwind"),
+        }
+    }
+
     const fn rustc(self) -> &'static str {
         match self {
             Toolchain::Rustup => "rustc",
@@ -121,7 +129,7 @@ fn debian_first() -> Result<std::ffi::OsString> {
     Ok(std::env::join_paths(std::iter::once(PathBuf::from("/usr/bin")).chain(std::env::split_paths(&path)))?)
 }
 
-/// Whether packages can be installed here without asking anybody.
+/// Whether packages can be installed here without asking.
 pub fn can_install() -> bool {
     let is_root = std::process::Command::new("id").arg("-u").output().is_ok_and(|id| id.stdout == b"0\n");
     is_root && Path::new("/etc/debian_version").exists()

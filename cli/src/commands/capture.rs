@@ -23,6 +23,7 @@ use crate::completion;
 use crate::live::LiveRecords;
 use crate::meter::Meter;
 use crate::progress::Progress;
+use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
 use crate::{args, stderr};
@@ -160,10 +161,7 @@ fn refuse_output(args: &Args) -> anyhow::Result<()> {
         Format::of_path(path)?;
     }
     // Files that follow one another take numbers that are free.
-    if path.is_file() && !args.force && args.write.rotate.is_empty() {
-        bail!("'{}' is there already; choose another name, or write over it with --force", path.display());
-    }
-    Ok(())
+    if args.write.rotate.is_empty() { refuse_older(path, args.force) } else { Ok(()) }
 }
 
 /// The channels that are captured, by number.

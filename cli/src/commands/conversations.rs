@@ -106,7 +106,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         }
         for event in events.drain(..) {
             summary.event(&event);
-            if !args.faults || is_fault(&event) {
+            if !args.faults || summary::is_fault(&event) {
                 write(&mut out, &event, args.json)?;
             }
         }
@@ -127,10 +127,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         summary.tell();
     }
     Ok(ExitCode::SUCCESS)
-}
-
-fn is_fault(event: &Event) -> bool {
-    event.trouble.is_some() || event.frames_lost || event.kind == "refusal"
 }
 
 fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {

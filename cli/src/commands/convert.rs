@@ -3,17 +3,21 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use anyhow::{Context, bail};
+use anyhow::bail;
+#[cfg(feature = "parquet")]
+use cantap_columns::parquet::Key;
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{DifConvention, Format, LineEnd, RotateAt, Rotation, TableStyle, WriteOptions, Zone};
 use cantap_trace::filter::Filter;
 
 use crate::args;
+#[cfg(feature = "parquet")]
+use crate::columns;
 use crate::completion;
 use crate::input::ReadArgs;
 use crate::interrupt;
 use crate::missing::by_kind;
-use crate::trace_output::{TraceOutput, failed};
+use crate::trace_output::{TraceOutput, named};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -22,8 +26,11 @@ use crate::trace_output::{TraceOutput, failed};
     cantap convert trace.asc.gz - --filter can0,123:7FF | canplayer\n  \
     cantap convert day.blf part.csv --start 10m --end 20m --channel 1\n  \
     cantap convert trace.pcapng old.trc --format trc1.1\n  \
-    cantap convert - days.log.zst --rotate 100M --keep 10\n\n\
+    cantap convert - days.log.zst --rotate 100M --keep 10\n  \
+    cantap convert drive.blf drive.parquet\n  \
+    cantap convert drive.blf fleet/ --partition vehicle=7,day,channel\n\n\
     Names end in .log, .asc, .blf, .trc, .csv, .pcapng, .mf4 or .dif; .gz, .zst, .xz and .lz4 behind that compress. \
+    .parquet is a table for DuckDB, Polars, pandas and Spark, with a row for each record. \
     Files of any other program are known by their beginning.\n\n\
     Dates in ASC, TRC, BLF and some logs are the clock of the computer that wrote them: name its zone with --zone.\n\n\
     Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, \
@@ -64,6 +71,11 @@ pub struct Args {
     end: Option<TimePoint>,
     #[command(flatten)]
     write: WriteArgs,
+    /// Make OUT a folder of Parquet files, in folders named by these in this order: day, channel, or NAME=VALUE. Engines read it as
+    /// one table. Files are called as IN: converting it again replaces them.
+    #[cfg(feature = "parquet")]
+    #[arg(long, value_name = "KEY", value_delimiter = ',', conflicts_with = "format")]
+    partition: Vec<Key>,
     /// Print the numbers as a JSON object, to standard error if the trace goes to standard output.
     #[arg(long)]
     json: bool,
@@ -123,14 +135,37 @@ impl WriteArgs {
     }
 }
 
+impl Args {
+    /// Whether OUT is no trace file but columns.
+    fn is_columns(&self) -> anyhow::Result<bool> {
+        #[cfg(feature = "parquet")]
+        {
+            let is_folder = !self.partition.is_empty();
+            if is_folder {
+                columns::refuse_file(&self.output)?;
+            }
+            Ok(is_folder || columns::is_parquet(&self.output))
+        }
+        #[cfg(not(feature = "parquet"))]
+        Ok(false)
+    }
+
+    fn create(&self, options: &WriteOptions, grows: bool) -> anyhow::Result<TraceOutput> {
+        #[cfg(feature = "parquet")]
+        if !self.partition.is_empty() {
+            let name = columns::name_of(&self.input);
+            return Ok(TraceOutput::dataset(&self.output, self.partition.clone(), name));
+        }
+        TraceOutput::create(&self.output, options, grows)
+    }
+}
+
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     refuse_same_file(&args.input, &args.output)?;
     let mut options = args.write.options(None)?;
-    if options.format.is_none() && args.output.as_os_str() != "-" {
-        let format = Format::of_path(&args.output);
-        let format = format.map_err(|error| std::io::Error::new(std::io::ErrorKind::InvalidInput, error));
-        options.format = Some(format.with_context(|| failed(&args.output))?);
+    if !args.is_columns()? {
+        options = named(options, &args.output)?;
     }
     let filter = args.filters.iter().chain(&args.filter_options).cloned().collect();
     let zone = args.write.zone.clone();
@@ -142,7 +177,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let mut output: Option<TraceOutput> = None;
     // Not before there is something to write: where nothing can be read, an older OUT stays as it is.
-    let create = || TraceOutput::create(&args.output, &options, grows);
+    let create = || args.create(&options, grows);
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();

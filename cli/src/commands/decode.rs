@@ -1,30 +1,34 @@
 //! `cantap decode`: a trace as signals.
 
+#[cfg(feature = "parquet")]
+mod columns;
 mod csv;
 mod decoded;
 mod json;
+mod output;
 mod text;
 mod wide;
 
 pub use decoded::Seconds;
 pub use text::write_values;
 
-use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Duration;
 
 use cantap::TraceEvent;
+#[cfg(feature = "parquet")]
+use cantap_columns::parquet::Key;
 use cantap_signals::Decoder;
 
 use self::decoded::Decoded;
-use self::wide::Wide;
+use self::output::{Form, Output};
 use crate::args;
 use crate::completion;
 use crate::databases::DatabaseArgs;
-use crate::input::ReadArgs;
+use crate::input::{ReadArgs, Records};
 use crate::live::LiveArgs;
-use crate::missing::Missing;
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -32,7 +36,8 @@ use crate::missing::Missing;
     cantap decode --db car.dbc trace.log\n  \
     cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
     candump -L can0 | cantap decode --db car.dbc - --json\n  \
-    cantap decode --db car.dbc trace.log --csv --resample 100ms > drive.csv\n  \
+    cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
+    cantap decode --db car.dbc trace.log -o drive.parquet\n  \
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
     identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
@@ -50,16 +55,30 @@ pub struct Args {
     /// repeated.
     #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
     signals: Vec<String>,
+    /// Write to this file instead of standard output. Its name may say the form: .csv, .json, or .parquet, a table for DuckDB,
+    /// Polars, pandas and Spark with a row per value, and one per loss or bus error.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<PathBuf>,
     /// One line of CSV per signal.
     #[arg(long, conflicts_with = "json")]
     csv: bool,
-    /// A column per signal and a line per frame. Written at the end of the trace.
-    #[arg(long, requires = "csv")]
+    /// In CSV and Parquet: a column per signal and a line per frame. Written at the end of the trace.
+    #[arg(long)]
     wide: bool,
-    /// A column per signal and a line every TIME, with the last value of each signal; empty where it was silent for long or
+    /// In CSV and Parquet: a column per signal and a line every TIME, with the last value of each signal; empty where it was silent for long or
     /// frames were lost. Written at the end of the trace.
-    #[arg(long, value_name = "TIME", requires = "csv", value_parser = args::positive_duration)]
+    #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     resample: Option<Duration>,
+    /// Make FILE a folder with a Parquet file for each message, which has a column per signal, and one for losses and bus errors.
+    #[cfg(feature = "parquet")]
+    #[arg(long, requires = "output", conflicts_with_all = ["csv", "json", "wide", "resample"])]
+    per_message: bool,
+    /// Make FILE a folder of Parquet files, in folders named by these in this order: day, channel, or NAME=VALUE. Engines read it
+    /// as one table. Files are called as IN: decoding it again replaces them.
+    #[cfg(feature = "parquet")]
+    #[arg(long, value_name = "KEY", value_delimiter = ',', requires = "output")]
+    #[arg(conflicts_with_all = ["csv", "json", "wide", "resample", "per_message"])]
+    partition: Vec<Key>,
     /// Print one JSON object per message, and behind them one with the summary.
     #[arg(long)]
     json: bool,
@@ -86,17 +105,18 @@ struct Count {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     if databases.is_empty() {
-        anyhow::bail!("no database to decode by; give one with --db FILE (.dbc or .toml)");
+        return Err(wrong(
+            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml)",
+        ));
     }
     let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
-    let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    let (count, missing) = decode(args, &decoder, &mut out)?;
-    if args.json {
-        let mut summary = serde_json::to_value(&count)?;
-        missing.put_into(&mut summary);
-        writeln!(out, "{}", serde_json::json!({ "summary": summary }))?;
-    }
-    out.flush()?;
+    let form = Form::of(args)?;
+    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
+    let mut output = Output::open(args, form, &decoder)?;
+    let count = decode(args, &decoder, &mut records, &mut output)?;
+    let mut summary = serde_json::to_value(&count)?;
+    records.missing().put_into(&mut summary);
+    output.finish(&summary)?;
     let Count { frames, decoded, values, lost } = count;
     eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values");
     if lost > 0 {
@@ -105,25 +125,24 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Result<(Count, Missing)> {
-    let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
+fn decode(
+    args: &Args,
+    decoder: &Decoder,
+    records: &mut Records,
+    output: &mut Output,
+) -> anyhow::Result<Count> {
     let mut count = Count::default();
     let mut values = Vec::new();
-    let step_ns = args.resample.map(|step| i64::try_from(step.as_nanos()).unwrap_or(i64::MAX));
-    let mut wide = (args.wide || step_ns.is_some()).then(|| Wide::new(step_ns)).transpose()?;
-    if args.csv && wide.is_none() {
-        csv::write_header(out)?;
-    }
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
         for record in &batch {
             if let TraceEvent::Lost { count: lost, .. } = record.event {
                 count.lost += u64::from(lost);
-                if let Some(wide) = &mut wide {
-                    wide.interrupt(record.channel);
-                }
             }
-            let Some(frame) = record.frame() else { continue };
+            let Some(frame) = record.frame() else {
+                output.push_event(record)?;
+                continue;
+            };
             count.frames += 1;
             let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
             // Chosen signals only: a message without any of them is not worth a line.
@@ -133,20 +152,11 @@ fn decode(args: &Args, decoder: &Decoder, out: &mut impl Write) -> anyhow::Resul
             count.decoded += 1;
             count.values += values.len() as u64;
             let message = decoder.message(reference);
-            let decoded = Decoded { record, frame, reference, message, values: &values };
-            match (&mut wide, args.json, args.csv) {
-                (Some(wide), ..) => wide.push(&decoded)?,
-                (_, true, _) => json::write(out, &decoded, args.details)?,
-                (.., true) => csv::write(out, &decoded)?,
-                _ => text::write(out, &decoded)?,
-            }
+            output.push(&Decoded { record, frame, reference, message, values: &values })?;
         }
         if records.may_wait() {
-            out.flush()?;
+            output.flush()?;
         }
     }
-    if let Some(wide) = wide {
-        wide.finish(out)?;
-    }
-    Ok((count, records.missing()))
+    Ok(count)
 }

@@ -21,12 +21,13 @@ pub struct Args {
 }
 
 /// The device's abilities by name.
-const CAPABILITIES: [(u32, &str); 5] = [
+const CAPABILITIES: [(u32, &str); 6] = [
     (capability::TRANSMIT, "transmit"),
     (capability::TIMED_TRANSMIT, "timed-transmit"),
     (capability::SLCAN, "slcan"),
     (capability::DEFAULTS, "defaults"),
     (capability::BOOTLOADER, "bootloader"),
+    (capability::EDGES, "edges"),
 ];
 
 /// Runs it.

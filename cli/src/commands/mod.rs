@@ -23,6 +23,7 @@ pub mod replay;
 pub mod search;
 pub mod selftest;
 pub mod send;
+pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
@@ -75,6 +76,8 @@ pub enum Command {
     /// Run a virtual device behind a pseudo terminal.
     #[cfg(unix)]
     Virtual(virtual_device::Args),
+    /// Share a device: many programs at once, on this machine or on others.
+    Serve(serve::Args),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
     /// Test a board: everything that it can show by itself, and a report to send in.
@@ -124,6 +127,7 @@ impl Command {
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
+            Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),
             Self::Replay(args) => replay::run(&args),

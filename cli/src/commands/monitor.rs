@@ -6,44 +6,47 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
 
-use anyhow::Context;
+use anyhow::{Context, bail};
 use cantap::wire::message::Mode;
-use cantap_signals::Decoder;
+use cantap_formats::WriteOptions;
 use cantap_trace::filter::Filter;
 
-use crate::address::Address;
+use crate::address::{Address, AddressError};
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
-use crate::databases::{self, DatabaseArgs};
+use crate::databases::{DatabaseArgs, Databases, Said};
 use crate::monitor::app::{App, SendEntry, View, parse_entry};
 use crate::monitor::model::Model;
+use crate::monitor::order::Order;
+use crate::monitor::plan::Plan;
 use crate::monitor::profile::Profile;
-use crate::monitor::source::{Order, Origin, Plan};
+use crate::monitor::source::Origin;
 use crate::monitor::theme::Theme;
 use crate::monitor::{once, orders, picture, run as show, text};
+use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
-    cantap monitor -d virtual -b 500k\n  \
+    cantap monitor virtual:car\n  \
     cantap monitor -d /dev/ttyACM0 -b 500k -b 2:250k --db car.dbc\n  \
     cantap monitor trace.blf -b 500k --db car.dbc\n  \
     cantap monitor -p car.toml\n\n\
 h shows the keys. Without a device and a file, the board that is connected is listened to. Without a bit rate, given or\n\
 saved on the device, it is looked for by listening.")]
 pub struct Args {
-    /// A trace to play back instead of a device.
-    #[arg(value_name = "FILE", conflicts_with = "devices")]
+    /// A trace to play back, or a device's address.
+    #[arg(value_name = "FILE|DEVICE", conflicts_with = "devices")]
     file: Option<PathBuf>,
     /// The device. Repeat for several, whose channels are numbered on: the second one's are 3 and 4.
     #[arg(short, long = "device", value_name = "DEVICE", add = completion::devices())]
     devices: Vec<Address>,
     /// Which channels: 1, 2, several as 1,3, or both, which is all. Without it, those whose bit rate is given; all if none is.
-    #[arg(short, long, value_parser = args::channels, conflicts_with = "file", add = completion::channels())]
+    #[arg(short, long, value_parser = args::channels, add = completion::channels())]
     channel: Option<args::Channels>,
     #[command(flatten)]
     open: ChannelArgs,
@@ -64,6 +67,9 @@ pub struct Args {
     /// Record to this file from the start.
     #[arg(short, long, value_name = "FILE")]
     output: Option<PathBuf>,
+    /// Record over a file that is there already.
+    #[arg(long, requires = "output")]
+    force: bool,
     /// Memory for scrolling back, in MB.
     #[arg(long, value_name = "MB", default_value_t = 64, value_parser = clap::value_parser!(u32).range(1..=4096))]
     history: u32,
@@ -99,39 +105,48 @@ fn size(text: &str) -> Result<(u16, u16), String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let file = args.file.as_deref().filter(|path| !path.exists());
-    if let Some(name) = file.and_then(Path::to_str).filter(|name| Address::is_no_port(name)) {
-        return Err(wrong(format!("'{name}' is a device: write cantap monitor -d {name}")));
-    }
-    // What is wrong with profile and databases is shown, and the view opens without it.
-    let mut complaints = Vec::new();
-    let profile = load_profile(args.profile.as_deref(), &mut complaints);
-    let decoder = load_databases(args, &profile, &mut complaints);
-    let open = channel_args(args, &profile, &mut complaints);
+    let (file, devices) = args.source()?;
+    refuse_recording(args)?;
+    // What is wrong with profile and databases is shown, and the view opens without it; with --once it is an error.
+    let mut said = Said::default();
+    let profile = load_profile(args.profile.as_deref(), &mut said);
+    let databases = load_databases(args, &devices, &profile, &mut said);
+    let decoder = databases.decoder_saying(&mut said);
+    let open = channel_args(args, &profile, &mut said);
     let options = ChannelBitrate::options(&open.timing.bitrates);
     let mut model = Model::new(Arc::new(decoder), options, args.history as usize * 1_000_000)?;
-    let filters = filters(args, &profile, &mut complaints);
+    let filters = filters(args, &profile, &mut said);
     model.history.set_filters(filters, None);
     for name in &profile.graph {
-        model.seen.signals.choose(name);
+        if let Err(error) = model.seen.signals.choose(name) {
+            said.faults.push(format!("graph: {error}"));
+        }
     }
-    let (origin, plan) = if let Some(path) = &args.file {
-        (Origin::File(path.clone()), None)
+    let name = file.as_deref().and_then(Path::file_name).map(|name| name.to_string_lossy().into_owned());
+    let (origin, plan) = if let Some(path) = file {
+        (Origin::File(path), None)
     } else {
-        let plan = plan(args, &profile, open, &mut complaints)?;
+        let plan = plan(args, devices, &profile, open, &mut said)?;
         (Origin::Device(plan.clone()), Some(plan))
     };
     let theme = Theme::from_environment(args.light || profile.light);
     let (sender, receiver) = orders();
     let mut app = App::new(args.view.or(profile.view).unwrap_or(View::Fixed), theme, plan, sender);
     app.sort = profile.sort.unwrap_or(app.sort);
-    app.send = send_list(&profile, &model, &mut complaints);
-    if let Some(path) = args.output.clone().or(profile.record.map(PathBuf::from)) {
+    app.send = send_list(&profile, &model, &mut said);
+    app.databases = databases;
+    app.file = name;
+    let record = profile.record.as_ref().map(|path| profile.folder.join(path));
+    if let Some(path) = args.output.clone().or(record) {
         app.orders.send(Order::Record(path))?;
     }
+    let Said { faults, remarks } = said;
     if args.once {
-        for complaint in complaints {
-            eprintln!("cantap: {complaint}");
+        if !faults.is_empty() {
+            bail!("{}", faults.join("\ncantap: "));
+        }
+        for remark in remarks {
+            eprintln!("cantap: {remark}");
         }
         let screen = once(origin, app, model, receiver, args.size, args.time)?;
         match &args.svg {
@@ -140,39 +155,74 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
                 .with_context(|| format!("cannot write {}", path.display()))?,
         }
     } else {
-        model.notice = complaints.join("; ");
+        model.notice = [faults, remarks].concat().join("; ");
         show(origin, app, model, receiver)?;
     }
     Ok(ExitCode::SUCCESS)
 }
 
-fn load_profile(path: Option<&Path>, complaints: &mut Vec<String>) -> Profile {
+impl Args {
+    /// The trace or the devices that were given.
+    fn source(&self) -> anyhow::Result<(Option<PathBuf>, Vec<Address>)> {
+        let Some(path) = &self.file else {
+            return Ok((None, self.devices.clone()));
+        };
+        if Address::is_meant_by(path) {
+            let address = path.to_str().unwrap_or_default().parse().map_err(wrong_address)?;
+            return Ok((None, vec![address]));
+        }
+        if self.channel.is_some() {
+            return Err(wrong(
+                "-c chooses a device's channels; of a trace's, -f can0,0:0 shows channel 1 alone",
+            ));
+        }
+        Ok((Some(path.clone()), Vec::new()))
+    }
+}
+
+#[expect(clippy::needless_pass_by_value, reason = "for map_err")]
+fn wrong_address(error: AddressError) -> anyhow::Error {
+    wrong(error.to_string())
+}
+
+/// Refuses a recording that cannot be made as asked. Its name may have a condition behind it: `FILE if CONDITION`.
+fn refuse_recording(args: &Args) -> anyhow::Result<()> {
+    let Some(text) = args.output.as_deref().and_then(Path::to_str) else { return Ok(()) };
+    let path = Path::new(text.split(" if ").next().unwrap_or(text));
+    if path.extension().is_some() {
+        named(WriteOptions::default(), path)?;
+    }
+    refuse_older(path, args.force)
+}
+
+fn load_profile(path: Option<&Path>, said: &mut Said) -> Profile {
     let loaded = path.map(Profile::load).transpose();
     loaded
         .unwrap_or_else(|complaint| {
-            complaints.push(complaint);
+            said.faults.push(complaint);
             None
         })
         .unwrap_or_default()
 }
 
-fn load_databases(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Decoder {
+fn load_databases(args: &Args, devices: &[Address], profile: &Profile, said: &mut Said) -> Databases {
     let own = if args.databases.is_empty() { profile.databases.as_slice() } else { &[] };
-    let databases = if own.is_empty() { args.databases.or_of(&args.devices) } else { args.databases.clone() };
-    if databases.is_of_car() {
-        complaints.push(databases::CAR.to_owned());
+    let given = if own.is_empty() { args.databases.or_of(devices) } else { args.databases.clone() };
+    let mut databases = given.to_begin_with(said);
+    for text in own {
+        databases.add(text, &profile.folder, said);
     }
-    databases.load_what_can_be(own, complaints)
+    databases
 }
 
 /// How channels are opened: what the command line leaves open, the profile says.
-fn channel_args(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> ChannelArgs {
+fn channel_args(args: &Args, profile: &Profile, said: &mut Said) -> ChannelArgs {
     let mut open = args.open.clone();
     if !open.timing.is_given() {
         for text in &profile.bitrates {
             match text.parse() {
                 Ok(rate) => open.timing.bitrates.push(rate),
-                Err(reason) => complaints.push(format!("bit rate {text}: {reason}")),
+                Err(reason) => said.faults.push(format!("bit rate {text}: {reason}")),
             }
         }
     }
@@ -182,12 +232,12 @@ fn channel_args(args: &Args, profile: &Profile, complaints: &mut Vec<String>) ->
     open
 }
 
-fn filters(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<Filter> {
+fn filters(args: &Args, profile: &Profile, said: &mut Said) -> Vec<Filter> {
     let mut filters = args.filter.clone();
     for text in if args.filter.is_empty() { profile.filters.as_slice() } else { &[] } {
         match text.parse() {
             Ok(filter) => filters.push(filter),
-            Err(error) => complaints.push(format!("filter {text}: {error}")),
+            Err(error) => said.faults.push(format!("filter {text}: {error}")),
         }
     }
     filters
@@ -195,18 +245,23 @@ fn filters(args: &Args, profile: &Profile, complaints: &mut Vec<String>) -> Vec<
 
 fn plan(
     args: &Args,
+    mut addresses: Vec<Address>,
     profile: &Profile,
     open: ChannelArgs,
-    complaints: &mut Vec<String>,
+    said: &mut Said,
 ) -> anyhow::Result<Plan> {
-    let mut addresses = args.devices.clone();
-    for text in profile.device.iter().chain(&profile.devices).filter(|_| args.devices.is_empty()) {
+    let own = if addresses.is_empty() {
+        profile.device.iter().chain(&profile.devices).cloned().collect()
+    } else {
+        Vec::new()
+    };
+    for text in own {
         match text.parse() {
             Ok(address) => addresses.push(address),
-            Err(error) => complaints.push(format!("device {text}: {error}")),
+            Err(error) => said.faults.push(format!("device {text}: {error}")),
         }
     }
-    if addresses.is_empty() && !complaints.is_empty() {
+    if addresses.is_empty() && !said.faults.is_empty() {
         addresses.push(Address::of_virtual_device());
     }
     let all = args::Channels::all();
@@ -220,12 +275,12 @@ fn plan(
     Ok(plan)
 }
 
-fn send_list(profile: &Profile, model: &Model, complaints: &mut Vec<String>) -> Vec<SendEntry> {
+fn send_list(profile: &Profile, model: &Model, said: &mut Said) -> Vec<SendEntry> {
     let mut entries = Vec::new();
     for text in &profile.send {
         match parse_entry(text, model) {
             Ok(entry) => entries.push(entry),
-            Err(reason) => complaints.push(format!("to send, {text}: {reason}")),
+            Err(reason) => said.faults.push(format!("to send, {text}: {reason}")),
         }
     }
     entries

@@ -20,6 +20,7 @@ use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::missing::Missing;
 use crate::trace_output::failed;
+use crate::wrong::wrong;
 use crate::{args, beside};
 use serde_json::json;
 
@@ -87,7 +88,7 @@ pub struct Args {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // A wrong name should not be found out after an hour of reading.
     if let Some(path) = &args.output {
-        PictureFormat::of_path(path)?;
+        PictureFormat::of_path(path).map_err(|error| wrong(error.to_string()))?;
     }
     let (mut plot, read) = collect(args)?;
     for pane in &mut plot.panes {
@@ -144,9 +145,9 @@ fn collect(args: &Args) -> anyhow::Result<(Plot, Read)> {
         return Ok((plot, read));
     }
     if args.databases.is_empty() {
-        bail!(
-            "no database to find signals in; give one with --db FILE, or ask for --bus-load or --timing ID"
-        );
+        return Err(wrong(
+            "no database to find signals in; give one with --db FILE, or ask for --bus-load or --timing ID",
+        ));
     }
     let decoder = args.databases.load_some(args.read.strict, args.quiet, &args.signals)?;
     let mut collector = SignalCollector::new(&decoder).with_most_curves(args.curves);

@@ -7,7 +7,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use cantap::{TraceEvent, TraceRecord};
-use cantap_formats::WriteOptions;
+use cantap_formats::{Format, WriteOptions};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
 use cantap_signals::{Decoder, SignalValue};
@@ -22,6 +22,7 @@ use crate::live::LiveArgs;
 use crate::missing::Missing;
 use crate::trace_output::TraceOutput;
 use crate::words::{error_name, failure_name, state_name};
+use crate::wrong::wrong;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -73,6 +74,9 @@ pub struct Args {
     /// Write what was found, with its context, as a trace.
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
+    /// The format to write, where the output's name does not tell.
+    #[arg(long, visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
+    format: Option<Format>,
     /// Print one JSON object per record, and behind them one with the summary.
     #[arg(long)]
     json: bool,
@@ -94,7 +98,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
     let condition = condition.context("condition")?;
     if condition.is_none() && args.ids.is_empty() && args.data.is_empty() {
-        anyhow::bail!("nothing to look for; give --id, --data or a condition (see cantap search --help)");
+        return Err(wrong(
+            "nothing to look for; give --id, --data or a condition (see cantap search --help)",
+        ));
     }
     let search = Search { ids: args.ids.clone(), data: args.data.clone(), condition };
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
@@ -164,7 +170,10 @@ impl Sink {
     fn new(args: &Args, decoder: Decoder, grows: bool) -> anyhow::Result<Self> {
         let stdout = || BufWriter::with_capacity(1 << 16, std::io::stdout());
         let kind = match (&args.output, args.count, args.json) {
-            (Some(path), ..) => Kind::Trace(TraceOutput::create(path, &WriteOptions::default(), grows)?),
+            (Some(path), ..) => {
+                let options = WriteOptions { format: args.format, ..WriteOptions::default() };
+                Kind::Trace(TraceOutput::create(path, &options, grows)?)
+            }
             (_, true, _) => Kind::Nowhere,
             (_, _, true) => Kind::Json(stdout()),
             _ => Kind::Text(stdout()),

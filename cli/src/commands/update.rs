@@ -72,7 +72,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 /// Whether the ROM bootloader's CAN pins (PB5 and PB13, AN2606) are channel 2's, as on every board that does not keep them apart
 /// (`docs/wiring.md`).
 fn drives_channel_2(board: &str) -> bool {
-    !matches!(board, "olimex-p405" | "virtual")
+    !matches!(board, "olimex-p405" | "virtual" | "virtual-car")
 }
 
 /// Says that channel 2 must be unplugged, and asks whether it is where somebody can answer.

@@ -2,8 +2,10 @@
 
 use std::fmt::Write as _;
 
-use cantap::TraceEvent;
 use cantap::wire::record::LossStage;
+use cantap::{TraceEvent, TraceRecord};
+
+use super::times::seconds;
 
 use crate::words::{error_name, failure_name, state_name};
 
@@ -45,6 +47,12 @@ fn stage_name(stage: LossStage) -> &'static str {
         LossStage::Link => "on the way to the host",
         LossStage::Host => "in the host",
     }
+}
+
+/// A frame as candump writes it.
+pub fn candump_line(record: &TraceRecord) -> Option<String> {
+    let frame = record.frame()?;
+    Some(format!("({}) {} {frame}", seconds(record.time_ns), cantap_trace::Interface(record.channel)))
 }
 
 /// Bytes as pairs of digits.

@@ -5,7 +5,9 @@ pub mod app;
 mod event_text;
 mod keyboard;
 pub mod model;
+pub mod order;
 pub mod picture;
+pub mod plan;
 pub mod profile;
 mod recorder;
 mod screen;
@@ -13,6 +15,7 @@ pub mod source;
 #[cfg(test)]
 mod tests;
 pub mod theme;
+mod times;
 pub mod views;
 
 use std::sync::mpsc::channel;
@@ -26,11 +29,12 @@ use ratatui::buffer::Buffer;
 use ratatui::crossterm::event::{self, Event, KeyEventKind};
 
 use crate::interrupt;
-use app::{App, Flow};
+use app::{App, Flow, Wish};
 use keyboard::{Keyboard, Waited};
-use model::{Model, SourceState};
+use model::{Model, Playing, SourceState};
+use order::Order;
 use screen::Screen;
-use source::{Order, Origin, Shared, lock};
+use source::{Origin, Shared, lock};
 
 /// The display is drawn anew so often: 25 times a second.
 const FRAME: Duration = Duration::from_millis(40);
@@ -38,26 +42,68 @@ const FRAME: Duration = Duration::from_millis(40);
 /// Shows the display until the user leaves.
 pub fn run(
     origin: Origin,
-    mut app: App,
+    app: App,
     model: Model,
     orders: std::sync::mpsc::Receiver<Order>,
 ) -> anyhow::Result<()> {
     interrupt::watch()?;
     let mut screen = Screen::enter()?;
-    let model: Shared = Arc::new(Mutex::new(model));
-    let thread = start(origin, &model, orders)?;
-    let result = display(&mut screen, &mut app, &model, || thread.is_finished());
+    let mut sources = vec![Watched::start(origin, app, model, orders)?];
+    let result = display(&mut screen, &mut sources);
     drop(screen);
-    // The source ends the recording properly before it goes.
-    let _ = app.orders.send(Order::Quit);
-    if thread.join().is_err() {
-        bail!("the source thread failed; please report this");
-    }
-    let notice = std::mem::take(&mut lock(&model).notice);
-    if !notice.is_empty() {
-        eprintln!("cantap: {notice}");
+    // Each ends its recording properly before it goes.
+    let notices: Vec<_> = sources.into_iter().map(Watched::end).collect();
+    for notice in notices {
+        let notice = notice?;
+        if !notice.is_empty() {
+            eprintln!("cantap: {notice}");
+        }
     }
     result
+}
+
+/// A source, what is known of it, and how it is looked at.
+struct Watched {
+    app: App,
+    model: Shared,
+    thread: std::thread::JoinHandle<()>,
+}
+
+impl Watched {
+    fn start(
+        origin: Origin,
+        app: App,
+        model: Model,
+        orders: std::sync::mpsc::Receiver<Order>,
+    ) -> anyhow::Result<Self> {
+        let model: Shared = Arc::new(Mutex::new(model));
+        let thread = start(origin, &model, orders)?;
+        Ok(Self { app, model, thread })
+    }
+
+    /// A trace beside this one, with the same databases, bit rates and room for the past.
+    fn beside(&self, path: std::path::PathBuf) -> anyhow::Result<Self> {
+        let (sender, receiver) = orders();
+        let model = {
+            let model = lock(&self.model);
+            let decoder = Arc::clone(model.seen.signals.decoder());
+            Model::new(decoder, model.options().clone(), model.history.memory().1)?
+        };
+        let mut app = App::new(self.app.view, self.app.theme, None, sender);
+        app.databases = self.app.databases.clone();
+        app.file = path.file_name().map(|name| name.to_string_lossy().into_owned());
+        Self::start(Origin::File(path), app, model, receiver)
+    }
+
+    /// Ends it; what there is to be said then.
+    fn end(self) -> anyhow::Result<String> {
+        // It may have ended by itself.
+        let _ = self.app.orders.send(Order::Quit);
+        if self.thread.join().is_err() {
+            bail!("the source thread failed; please report this");
+        }
+        Ok(std::mem::take(&mut lock(&self.model).notice))
+    }
 }
 
 fn start(
@@ -71,21 +117,20 @@ fn start(
 }
 
 /// Until the user leaves, a signal asks for it, or there is no source or no terminal any more.
-fn display(
-    screen: &mut Screen,
-    app: &mut App,
-    model: &Shared,
-    is_over: impl Fn() -> bool,
-) -> anyhow::Result<()> {
+fn display(screen: &mut Screen, sources: &mut Vec<Watched>) -> anyhow::Result<()> {
     let stops = Stops::watch()?;
     let keyboard = Keyboard::new()?;
-    while !interrupt::requested() && !is_over() {
+    let mut current = 0;
+    while !interrupt::requested() && !sources.iter().any(|source| source.thread.is_finished()) {
         let drawn = Instant::now();
+        let count = sources.len();
+        let Watched { app, model, .. } = &mut sources[current];
+        app.beside = (current + 1, count);
         screen.draw(app, model)?;
         let mut flow = if stops.asked() { Flow::Suspend } else { Flow::GoOn };
         // What happens meanwhile is answered at once.
         let mut wait = FRAME.saturating_sub(drawn.elapsed());
-        while flow == Flow::GoOn {
+        while flow == Flow::GoOn && app.wish.is_none() {
             match keyboard.wait(wait)? {
                 Waited::Event => {}
                 Waited::Nothing => break,
@@ -108,8 +153,38 @@ fn display(
         if let Some(text) = app.clipboard.take() {
             screen::copy(&text)?;
         }
+        if let Some(wish) = app.wish.take() {
+            current = follow(wish, sources, current)?;
+        }
     }
     Ok(())
+}
+
+/// Opens, chooses or closes a source; which one is looked at then.
+fn follow(wish: Wish, sources: &mut Vec<Watched>, current: usize) -> anyhow::Result<usize> {
+    match wish {
+        Wish::Beside(path) => {
+            let beside = sources[current].beside(path)?;
+            sources.push(beside);
+            Ok(sources.len() - 1)
+        }
+        Wish::Next => {
+            if sources.len() == 1 {
+                "there is one source; O opens a trace beside it".clone_into(&mut sources[0].app.message);
+            }
+            Ok((current + 1) % sources.len())
+        }
+        Wish::Close if sources.len() == 1 => {
+            "there is no other source; q leaves".clone_into(&mut sources[0].app.message);
+            Ok(0)
+        }
+        Wish::Close => {
+            let said = sources.remove(current).end()?;
+            let next = current.min(sources.len() - 1);
+            sources[next].app.message = said;
+            Ok(next)
+        }
+    }
 }
 
 /// Whether another program asked this one to stop for a while (SIGTSTP), as a shell's job control does.
@@ -166,7 +241,7 @@ pub fn once(
     loop {
         let state = lock(&model).source.clone();
         match state {
-            SourceState::Playing { ended: true, .. } => break,
+            SourceState::Playing(Playing { ended: true, .. }) => break,
             SourceState::Gone(reason) => bail!("{reason}"),
             _ if !is_file && start.elapsed() >= time => break,
             _ => std::thread::sleep(Duration::from_millis(10)),

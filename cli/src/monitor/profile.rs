@@ -1,6 +1,6 @@
 //! A profile: everything about a bus in one file, for `cantap monitor -p car.toml`.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 use super::app::{Column, View};
 
@@ -16,7 +16,7 @@ pub struct Profile {
     pub bitrates: Vec<String>,
     /// Take part in the bus instead of listening only.
     pub normal: bool,
-    /// Signal databases, as after `--db`.
+    /// Signal databases, as after `--db`; where they are begins at the profile.
     pub databases: Vec<String>,
     /// Filters in candump's syntax.
     pub filters: Vec<String>,
@@ -24,14 +24,17 @@ pub struct Profile {
     pub view: Option<View>,
     /// What the fixed view is sorted by.
     pub sort: Option<Column>,
-    /// Signals in the graph, by name.
+    /// Signals in the graph: `Speed`, `Engine.Speed`, patterns such as `Wheel*`.
     pub graph: Vec<String>,
     /// Frames to send, as typed on the page Send: `["123#11 100ms"]`.
     pub send: Vec<String>,
-    /// A file to record to from the start.
+    /// A file to record to from the start; where it is begins at the profile.
     pub record: Option<String>,
     /// For light backgrounds.
     pub light: bool,
+    /// Where it was read from: paths in it that are not absolute begin there.
+    #[serde(skip)]
+    pub folder: PathBuf,
 }
 
 impl Profile {
@@ -39,7 +42,8 @@ impl Profile {
     pub fn load(path: &Path) -> Result<Self, String> {
         let text =
             std::fs::read_to_string(path).map_err(|error| format!("profile {}: {error}", path.display()))?;
-        Self::parse(&text).map_err(|reason| format!("profile {}, {reason}", path.display()))
+        let profile = Self::parse(&text).map_err(|reason| format!("profile {}, {reason}", path.display()))?;
+        Ok(Self { folder: path.parent().unwrap_or(Path::new("")).to_owned(), ..profile })
     }
 
     fn parse(text: &str) -> Result<Self, String> {

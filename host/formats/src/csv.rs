@@ -8,9 +8,9 @@ mod python_can;
 mod rows;
 
 pub(crate) use full::Encoder as FullEncoder;
+pub(crate) use python_can::Encoder as PythonCanEncoder;
 #[cfg(feature = "sqlite")]
-pub(crate) use python_can::time_ns as python_time_ns;
-pub(crate) use python_can::{Encoder as PythonCanEncoder, Message};
+pub(crate) use python_can::{Message, time_ns as python_time_ns};
 
 use std::collections::VecDeque;
 use std::io;

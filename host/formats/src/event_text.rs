@@ -5,50 +5,12 @@
 use std::fmt;
 use std::str::FromStr;
 
-use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
-
 use cantap_trace::TraceEvent;
+use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, item, name};
+use cantap_wire::record::TransmitFailure;
 
 /// Marks such a text in a comment.
 pub(crate) const MARK: &str = "cantap: ";
-
-const STAGES: [(LossStage, &str); 4] = [
-    (LossStage::Controller, "controller"),
-    (LossStage::Queue, "queue"),
-    (LossStage::Link, "link"),
-    (LossStage::Host, "host"),
-];
-const KINDS: [(BusErrorKind, &str); 6] = [
-    (BusErrorKind::Stuff, "stuff"),
-    (BusErrorKind::Form, "form"),
-    (BusErrorKind::Acknowledgment, "acknowledgment"),
-    (BusErrorKind::BitRecessive, "bit-recessive"),
-    (BusErrorKind::BitDominant, "bit-dominant"),
-    (BusErrorKind::Crc, "crc"),
-];
-const STATES: [(ErrorState, &str); 4] = [
-    (ErrorState::Active, "active"),
-    (ErrorState::Warning, "warning"),
-    (ErrorState::Passive, "passive"),
-    (ErrorState::BusOff, "bus-off"),
-];
-const FAILURES: [(TransmitFailure, &str); 5] = [
-    (TransmitFailure::ArbitrationLost, "arbitration-lost"),
-    (TransmitFailure::BusError, "bus-error"),
-    (TransmitFailure::Aborted, "aborted"),
-    (TransmitFailure::Closed, "closed"),
-    (TransmitFailure::BusOff, "bus-off"),
-];
-/// The one reason that has a number.
-const OVERTAKEN: &str = "overtaken";
-
-fn name<T: PartialEq>(names: &[(T, &'static str)], item: &T) -> &'static str {
-    names.iter().find(|(known, _)| known == item).map_or("", |(_, name)| *name)
-}
-
-fn item<T: Copy>(names: &[(T, &str)], name: &str) -> Option<T> {
-    names.iter().find(|(_, known)| *known == name).map(|(item, _)| *item)
-}
 
 /// An event other than a frame, in words. A frame has none and shows as nothing.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -61,22 +23,22 @@ impl fmt::Display for EventText {
             TraceEvent::Lost { stage, count, at_least } => {
                 write!(f, "lost {count}{}", if *at_least { "+" } else { "" })?;
                 if let Some(stage) = stage {
-                    write!(f, " {}", name(&STAGES, stage))?;
+                    write!(f, " {}", name(&LOSS_STAGES, stage))?;
                 }
             }
             TraceEvent::BusError { kind, .. } => {
                 f.write_str("bus-error")?;
                 if let Some(kind) = kind {
-                    write!(f, " {}", name(&KINDS, kind))?;
+                    write!(f, " {}", name(&BUS_ERRORS, kind))?;
                 }
             }
             TraceEvent::ErrorsSuppressed { count } => write!(f, "errors-suppressed {count}")?,
-            TraceEvent::State { state, .. } => write!(f, "state {}", name(&STATES, state))?,
+            TraceEvent::State { state, .. } => write!(f, "state {}", name(&ERROR_STATES, state))?,
             TraceEvent::TransmitFailed { tag, reason } => match reason {
                 TransmitFailure::Overtaken { periods } => {
                     write!(f, "transmit-failed {OVERTAKEN} tag={tag} periods={periods}")?;
                 }
-                _ => write!(f, "transmit-failed {} tag={tag}", name(&FAILURES, reason))?,
+                _ => write!(f, "transmit-failed {} tag={tag}", name(&TRANSMIT_FAILURES, reason))?,
             },
         }
         if let TraceEvent::BusError { counters: Some((tec, rec)), .. }
@@ -122,24 +84,24 @@ fn parse(text: &str) -> Option<TraceEvent> {
                 None => (count, false),
             };
             let stage = match stage {
-                Some(stage) => Some(item(&STAGES, stage)?),
+                Some(stage) => Some(item(&LOSS_STAGES, stage)?),
                 None => None,
             };
             TraceEvent::Lost { stage, count: count.parse().ok()?, at_least }
         }
         ("bus-error", [None, None]) => TraceEvent::BusError { kind: None, counters },
         ("bus-error", [Some(kind), None]) => {
-            TraceEvent::BusError { kind: Some(item(&KINDS, kind)?), counters }
+            TraceEvent::BusError { kind: Some(item(&BUS_ERRORS, kind)?), counters }
         }
         ("errors-suppressed", [Some(count), None]) => {
             TraceEvent::ErrorsSuppressed { count: count.parse().ok()? }
         }
-        ("state", [Some(state), None]) => TraceEvent::State { state: item(&STATES, state)?, counters },
+        ("state", [Some(state), None]) => TraceEvent::State { state: item(&ERROR_STATES, state)?, counters },
         ("transmit-failed", [Some(OVERTAKEN), None]) => {
             TraceEvent::TransmitFailed { tag: tag?, reason: TransmitFailure::Overtaken { periods: periods? } }
         }
         ("transmit-failed", [Some(reason), None]) => {
-            TraceEvent::TransmitFailed { tag: tag?, reason: item(&FAILURES, reason)? }
+            TraceEvent::TransmitFailed { tag: tag?, reason: item(&TRANSMIT_FAILURES, reason)? }
         }
         _ => return None,
     })

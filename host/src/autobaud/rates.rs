@@ -1,90 +1,101 @@
-//! Which rates a controller reaches, and which of them and with what timing are worth listening to.
+//! Which bit rate a measured one is, as far as the controller's clock reaches it.
 
 use cantap_wire::BitTiming;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 
-use super::hearing::Bounds;
-
-/// Bit rates in use, in bit/s, those of CiA and of vehicles, the likeliest first.
+/// Bit rates in use, in bit/s, those of CiA and of vehicles.
 pub const COMMON_BPS: [u32; 14] = [
     500_000, 250_000, 125_000, 1_000_000, 100_000, 50_000, 83_333, 33_333, 800_000, 20_000, 10_000, 5_000,
     95_238, 62_500,
 ];
 
-/// Rates nearer than this cannot be told apart by listening, and need not be.
-pub(super) const SAME: f64 = 0.005;
+/// What two crystals are off from one another, at most: 100 ppm each, and what a warm device adds.
+const CRYSTALS: f64 = 0.000_3;
+/// So much beside the bus's rate a receiver takes every frame, whatever its sample point: in the ten bits that may pass without an edge to
+/// synchronise on, it makes a twentieth of a bit.
+const REACH: f64 = 0.005;
 
-/// The scan's step: near enough that one of two neighbours is heard.
-const SCAN_STEP: f64 = 1.007;
+/// A measured bit rate, as a controller has it.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) enum Reached {
+    /// At this one.
+    At { bitrate_bps: u32 },
+    /// Its clock reaches none that is near enough; this one is the nearest.
+    Not { nearest_bps: Option<u32> },
+}
 
-/// Every reachable rate, thinned to one in each [`SCAN_STEP`], from the fastest down.
-pub(super) fn scan_rates(clock_hz: u32) -> Vec<u32> {
-    let mut rates: Vec<u32> = Vec::new();
-    for clocks in (clock_hz / MAX_BITRATE_BPS).max(1)..=clock_hz / MIN_BITRATE_BPS {
-        let rate = f64::from(clock_hz) / f64::from(clocks);
-        let far = rates.last().is_none_or(|last| f64::from(*last) / rate >= SCAN_STEP);
-        if far && BitTiming::of_clocks(clocks).next().is_some() {
-            rates.push(rate.round() as u32);
-        }
+/// The bit rate of a controller with this clock that a measured one is, give or take its standard error (a part of it).
+///
+/// A common rate is taken for one where the measurement allows it. Below 100 kbit/s the clock's own rates are less than a thousandth apart.
+pub(super) fn reach(clock_hz: u32, measured_bps: f64, error: f64) -> Reached {
+    let off = |bps: u32| (f64::from(bps) / measured_bps - 1.0).abs();
+    let allowed = 3.0 * error + CRYSTALS;
+    let is_reached =
+        |bps: &u32| clock_hz.div_ceil(*bps) > 0 && BitTiming::all(clock_hz, *bps).next().is_some();
+    let nearest = |rates: &mut dyn Iterator<Item = u32>| rates.min_by(|a, b| off(*a).total_cmp(&off(*b)));
+    let common = &mut COMMON_BPS.into_iter().filter(|bps| off(*bps) <= allowed).filter(is_reached);
+    if let Some(bitrate_bps) = nearest(common) {
+        return Reached::At { bitrate_bps };
     }
-    rates
-}
-
-/// Controller clocks per bit, rounded.
-pub(super) fn clocks_of(clock_hz: u32, rate: f64) -> u32 {
-    (f64::from(clock_hz) / rate).round() as u32
-}
-
-/// The rates between the bounds that the clock reaches exactly and that are whole kilobits, but for the common ones: what leads
-/// here is none of those.
-pub(super) fn round_rates(clock_hz: u32, bounds: &Bounds) -> impl Iterator<Item = u32> {
-    let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS)) as u32 / 1000;
-    let most = bounds.most_bps.min(f64::from(MAX_BITRATE_BPS)) as u32 / 1000;
-    let inside = bounds.least_bps..=bounds.most_bps;
-    (least..=most)
-        .map(|kbps| kbps * 1000)
-        .filter(move |bps| inside.contains(&f64::from(*bps)) && !COMMON_BPS.contains(bps))
-        .filter(move |bps| {
-            clock_hz.is_multiple_of(*bps) && BitTiming::of_clocks(clock_hz / bps).next().is_some()
-        })
-}
-
-/// The timing that takes the least of other rates: the latest sample point for a bus that is faster, and the shortest jump for one
-/// that is slower.
-pub(super) fn sharpest(clocks: u32) -> Option<BitTiming> {
-    BitTiming::of_clocks(clocks)
-        .max_by_key(|timing| (timing.sample_point_permille(), timing.quanta()))
-        .map(|timing| BitTiming { jump_width: 1, ..timing })
-}
-
-/// The reachable rate, in clocks per bit, that tells most: the one nearest to the middle of the bounds and not too near
-/// to one that was studied.
-pub(super) fn next_to_study(clock_hz: u32, bounds: &Bounds, tried: &[u32]) -> Option<u32> {
-    let middle = bounds.middle_bps()?;
-    let rate = |clocks: u32| f64::from(clock_hz) / f64::from(clocks);
-    let most = bounds.most_bps.min(f64::from(MAX_BITRATE_BPS));
-    let least = bounds.least_bps.max(f64::from(MIN_BITRATE_BPS));
-    (clocks_of(clock_hz, most).max(1)..=clocks_of(clock_hz, least))
-        .filter(|clocks| {
-            (least..=most).contains(&rate(*clocks)) && BitTiming::of_clocks(*clocks).next().is_some()
-        })
-        .filter(|clocks| tried.iter().all(|near| (rate(*near) / rate(*clocks) - 1.0).abs() > SAME / 2.0))
-        .min_by(|a, b| (rate(*a) - middle).abs().total_cmp(&(rate(*b) - middle).abs()))
+    let clocks = (f64::from(clock_hz) / measured_bps).round() as u32;
+    // One clock in three or four has a timing up there, nearly every one further down.
+    let around = clocks.saturating_sub(8).max(1)..=clocks + 8;
+    let rates = around
+        .filter(|clocks| BitTiming::of_clocks(*clocks).next().is_some())
+        .map(|clocks| (f64::from(clock_hz) / f64::from(clocks)).round() as u32)
+        .filter(|bps| (MIN_BITRATE_BPS..=MAX_BITRATE_BPS).contains(bps));
+    match nearest(&mut { rates }) {
+        Some(bitrate_bps) if off(bitrate_bps) <= REACH => Reached::At { bitrate_bps },
+        nearest_bps => Reached::Not { nearest_bps },
+    }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    const CLOCK_HZ: u32 = 36_000_000;
+
     #[test]
-    fn the_scan_leaves_no_gap_that_a_rate_could_hide_in() {
-        let rates = scan_rates(36_000_000);
-        assert_eq!(rates.first(), Some(&1_000_000));
-        assert!(rates.iter().all(|rate| (5_000..=1_000_000).contains(rate)));
-        // Fast rates have few dividers: there the clock itself sets the steps.
-        for pair in rates.windows(2).filter(|pair| pair[0] < 300_000) {
-            assert!(f64::from(pair[0]) / f64::from(pair[1]) < 1.03, "{pair:?}");
+    fn every_rate_that_the_clock_reaches_is_found_through_its_crystal_s_error() {
+        let mut rates = 0;
+        for clocks in 36..=7200_u32 {
+            if BitTiming::of_clocks(clocks).next().is_none() {
+                continue;
+            }
+            let exact = f64::from(CLOCK_HZ) / f64::from(clocks);
+            rates += 1;
+            for ppm in [-60.0, 0.0, 60.0] {
+                let Reached::At { bitrate_bps } = reach(CLOCK_HZ, exact * (1.0 + ppm / 1e6), 0.000_02) else {
+                    panic!("{exact}")
+                };
+                // A neighbour that is common may be taken for it, where a measurement cannot tell them apart.
+                let off = (f64::from(bitrate_bps) / exact - 1.0).abs();
+                assert!(off <= 0.000_45, "{exact} by {ppm} ppm: {bitrate_bps}");
+            }
         }
-        assert!(rates.len() < 800, "{}", rates.len());
+        assert!(rates > 2000, "{rates}");
+    }
+
+    #[test]
+    fn common_rates_are_taken_where_the_measurement_allows_it_and_not_else() {
+        for bps in COMMON_BPS {
+            for ppm in [-250.0, 0.0, 250.0] {
+                let measured = f64::from(bps) * (1.0 + ppm / 1e6);
+                assert_eq!(reach(CLOCK_HZ, measured, 0.000_1), Reached::At { bitrate_bps: bps });
+            }
+        }
+        // 36 MHz / 1078.
+        assert_eq!(reach(CLOCK_HZ, 33_400.0, 0.000_05), Reached::At { bitrate_bps: 33_395 });
+    }
+
+    #[test]
+    fn odd_rates_have_their_names_and_what_is_between_two_has_none() {
+        for (measured, bitrate_bps) in [(33_333.3, 33_333), (47_619.0, 47_619), (83_333.3, 83_333)] {
+            assert_eq!(reach(CLOCK_HZ, measured, 0.000_1), Reached::At { bitrate_bps });
+        }
+        // 36 MHz / 58.5: 57 and 60 clocks have timings.
+        let far = reach(CLOCK_HZ, 615_384.0, 0.000_5);
+        assert_eq!(far, Reached::Not { nearest_bps: Some(600_000) });
     }
 }

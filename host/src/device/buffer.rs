@@ -1,4 +1,4 @@
-//! Between the reader thread and whoever uses the records: bounded, and the reader never waits. What does
+//! Between the reader thread and the consumer of the records: bounded, and the reader never waits. What does
 //! not fit is counted, and a loss record stands in its place.
 
 use std::collections::VecDeque;

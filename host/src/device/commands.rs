@@ -1,7 +1,7 @@
 //! What a device can be asked, one method each.
 
 use cantap_wire::message::{
-    ChannelConfig, Defaults, Failures, Filter, Periodic, Registers, Status, Trigger, TxFrame,
+    ChannelConfig, Defaults, Edges, Failures, Filter, Periodic, Registers, Status, Trigger, TxFrame,
 };
 use cantap_wire::{Channel, Command, Refusal, Reply};
 
@@ -20,6 +20,19 @@ impl Device {
     pub fn failures(&self) -> Result<Failures, DeviceError> {
         match self.request(Command::Failures)? {
             Reply::Failures(failures) => Ok(failures),
+            _ => Err(DeviceError::WrongReply),
+        }
+    }
+
+    /// Watches a closed channel's receive pin from now on, whatever the bit rate; `None` ends it. Nothing is driven.
+    pub fn measure_edges(&self, channel: Option<Channel>) -> Result<(), DeviceError> {
+        self.done(Command::MeasureEdges { channel })
+    }
+
+    /// What was measured since the last call. Where there are [`MAX_EDGES`](cantap_wire::message::MAX_EDGES), there are more.
+    pub fn edges(&self) -> Result<Edges, DeviceError> {
+        match self.request(Command::Edges)? {
+            Reply::Edges(edges) => Ok(edges),
             _ => Err(DeviceError::WrongReply),
         }
     }

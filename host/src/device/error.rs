@@ -148,12 +148,16 @@ pub enum DeviceError {
 pub enum SessionOver {
     /// The device says that the computer suspended it.
     Suspended,
-    /// The device refuses requests for want of one.
+    /// The device refuses requests because there is none.
     Refused,
     /// Another program greets the device on our port.
     Greeted,
     /// The stream begins anew.
     StreamWentBack,
+    /// The board's server has lost it.
+    BoardLost,
+    /// The board's server has ended.
+    ServerEnded,
 }
 
 impl DeviceError {
@@ -177,6 +181,8 @@ impl fmt::Display for SessionOver {
             Self::StreamWentBack => {
                 "its stream began anew, because another program took it over or it was restarted"
             }
+            Self::BoardLost => "its server has lost the board",
+            Self::ServerEnded => "its server has ended",
         })
     }
 }
@@ -267,6 +273,17 @@ fn sentence(refusal: Refusal) -> String {
         }
         Refusal::NothingSaved => "nothing is saved on it; give the bit rate, or save a configuration first",
         Refusal::NotBusOff => "the channel is not bus-off; there is nothing to recover from",
+        Refusal::NotMeasuring => "no receive pin is watched; begin the measurement first",
+        Refusal::NotGranted { needs } => {
+            return format!("its server does not let this client do that, which needs the right to {needs}");
+        }
+        Refusal::Held => {
+            "another client of its server holds the right to configure; wait until that has left"
+        }
+        Refusal::OtherSettings => {
+            "other clients of its server have the channel open, with another bit rate or mode; open it as they have"
+        }
+        Refusal::NoBoard => "its server has no board at the moment; connect the board to it again",
     };
     fixed.to_owned()
 }

@@ -18,7 +18,7 @@ pub const PIECE_BYTES: usize = 4096;
 /// What was received and lost on one channel since the session began.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ChannelCounters {
-    /// Frames that arrived from the device.
+    /// Frames that arrived from the device, at this program or at the server of a shared board.
     pub received: u64,
     /// Times the controller's FIFO overran: at least this many frames were lost.
     pub lost_controller: u64,
@@ -131,7 +131,7 @@ pub struct Intake {
     counters: Counters,
     /// Device time of the latest record, in ticks.
     latest_ticks: u64,
-    /// `Hello` was answered; what came before belongs to somebody else's session.
+    /// `Hello` was answered; what came before belongs to another program's session.
     in_session: bool,
 }
 
@@ -199,7 +199,7 @@ impl Intake {
                 }
             }
             Decoded::Response(response) => {
-                // A later one was asked for by somebody else, or twice by us before the first was answered.
+                // A later one was asked for by another program, or twice by us before the first was answered.
                 if let (Ok(Reply::Hello(answer)), false) = (&response.result, *in_session) {
                     // What stands before belongs to a session that is over.
                     *in_session = true;
@@ -350,7 +350,11 @@ fn on_event(
                 LossStage::Controller => counters.lost_controller += u64::from(count),
                 LossStage::Queue => counters.lost_queue += u64::from(count),
                 LossStage::Link => counters.lost_link += u64::from(count),
-                LossStage::Host => counters.lost_host += u64::from(count),
+                // A server of a shared board had them, and this client was too slow.
+                LossStage::Host => {
+                    counters.received += u64::from(count);
+                    counters.lost_host += u64::from(count);
+                }
             }
             (channel, TraceEvent::Lost { stage: Some(stage), count, at_least })
         }

@@ -32,6 +32,6 @@ impl Link {
 }
 
 /// Whether a read only found nothing yet.
-pub(super) fn is_idle(error: &io::Error) -> bool {
+pub fn is_idle(error: &io::Error) -> bool {
     matches!(error.kind(), io::ErrorKind::TimedOut | io::ErrorKind::WouldBlock | io::ErrorKind::Interrupted)
 }

@@ -37,13 +37,15 @@ pub use clock::{
 pub(crate) use error::no_timing;
 pub use error::{DeviceError, SessionOver};
 pub use intake::{ChannelCounters, Counters, Intake, Notice, PIECE_BYTES, Transmission};
-pub use link::Link;
+pub use link::{Link, is_idle};
 pub use pipe::{PipeReader, PipeWriter, pipe};
+pub use reader::{encode, write_patiently};
 pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 #[cfg(feature = "serial")]
-pub use serial::{Board, list, port_of};
+pub use serial::{Board, list, open as open_port, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
+pub use watch::{Next, Watch};
 
 use crate::TraceRecord;
 use reader::{Answer, Order, Shared};
@@ -52,7 +54,7 @@ use reader::{Answer, Order, Shared};
 const BUFFER_RECORDS: usize = 1 << 20;
 /// A request is given up after this time.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(2);
-/// How often `Hello` is tried: a device may have half a line of somebody else's in its input.
+/// How often `Hello` is tried: a device may have half a line from another program in its input.
 const HELLO_TRIES: u32 = 3;
 /// So long for each try.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
@@ -88,8 +90,13 @@ impl Device {
 
     /// Talks to the device at the other end of a byte stream; `name` is what messages call it.
     pub fn over(link: Link, name: &str) -> Result<Self, DeviceError> {
+        Self::over_holding(link, name, BUFFER_RECORDS)
+    }
+
+    /// The same, and at most so many records wait for who takes them; others are lost, and counted.
+    pub fn over_holding(link: Link, name: &str, records: usize) -> Result<Self, DeviceError> {
         let Link { reader, writer, keep_alive } = link;
-        let shared = Arc::new(Shared::new(name, writer, BUFFER_RECORDS));
+        let shared = Arc::new(Shared::new(name, writer, records));
         let (orders, received_orders) = std::sync::mpsc::channel();
         let for_thread = Arc::clone(&shared);
         let thread = std::thread::Builder::new()

@@ -1,4 +1,4 @@
-//! The thread that reads a device's port. It waits for nobody: requests are answered through channels that
+//! The thread that reads a device's port. It never waits: requests are answered through channels that
 //! always have room, records go into a bounded buffer.
 
 use std::collections::HashMap;
@@ -93,7 +93,11 @@ impl Output {
 }
 
 /// Writes all, waiting as long as the other end makes us wait, at most for `patience` without taking anything.
-fn write_patiently(port: &mut dyn Write, mut bytes: &[u8], patience: Duration) -> std::io::Result<()> {
+pub fn write_patiently(
+    port: &mut (impl Write + ?Sized),
+    mut bytes: &[u8],
+    patience: Duration,
+) -> std::io::Result<()> {
     let mut moved = Instant::now();
     while !bytes.is_empty() {
         match port.write(bytes) {
@@ -223,7 +227,7 @@ impl Shared {
         })
     }
 
-    /// The reader's own question for the time; nobody waits for it, and it waits for nobody.
+    /// The reader's own question for the time; nothing waits for it, and it waits for nothing.
     fn ask_time(&self) {
         let Ok(mut output) = self.output.try_lock() else { return };
         let mut pending = lock(&self.pending);
@@ -238,7 +242,7 @@ impl Shared {
 }
 
 /// A request as it goes over the wire.
-pub(crate) fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
+pub fn encode(request: &Request) -> Result<Vec<u8>, DeviceError> {
     let mut message = [0; MAX_REQUEST + CRC_LEN];
     let mut out = vec![0; max_encoded_len(MAX_REQUEST)];
     let encoded = framing::encode(request, &mut message, &mut out).ok_or(DeviceError::RequestTooLong)?;
@@ -281,9 +285,13 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
                 Notice::Stopped(channel) => published.stopped[channel.index()] += 1,
                 Notice::Transmission(transmission) => report(shared, transmission),
                 Notice::WentBack => heard.end = heard.end.or(Some(SessionOver::StreamWentBack)),
-                Notice::Ended { time_ns, reason: EndReason::Suspended } => {
+                Notice::Ended { time_ns, reason } => {
                     published.ended_ns = Some(time_ns);
-                    heard.end = Some(SessionOver::Suspended);
+                    heard.end = Some(match reason {
+                        EndReason::Suspended => SessionOver::Suspended,
+                        EndReason::BoardLost => SessionOver::BoardLost,
+                        EndReason::ServerEnded => SessionOver::ServerEnded,
+                    });
                 }
             });
             if !records.is_empty() || heard.answered {
@@ -363,7 +371,7 @@ fn follow(orders: &Receiver<Order>, intake: &mut Intake, shared: &Shared) -> boo
     false
 }
 
-/// Passes an answer to whoever asked. Returns the device's time and when it was asked for, if it was.
+/// Passes an answer to the caller that asked. Returns the device's time and when it was asked for, if it was.
 fn answer(shared: &Shared, response: Response) -> Option<(Ticks, Instant)> {
     let mut pending = lock(&shared.pending);
     let time = match (&response.result, pending.clock) {

@@ -46,7 +46,7 @@ pub fn port_of(serial_number: &str) -> Option<String> {
 }
 
 /// Opens a port for this program alone, in raw mode, and raises DTR.
-pub(super) fn open(port: &str) -> Result<Link, DeviceError> {
+pub fn open(port: &str) -> Result<Link, DeviceError> {
     let open = serialport::new(port, NOMINAL_BAUD).timeout(READ_TIMEOUT).dtr_on_open(true).open();
     let reader = open.map_err(|error| translate(port, error))?;
     let writer = reader.try_clone().map_err(|error| translate(port, error))?;

@@ -15,7 +15,7 @@ const LONGEST_PASS: Duration = Duration::from_millis(100);
 
 /// What the reader is to do next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Next {
+pub enum Next {
     /// Nothing.
     Listen,
     /// Ask for the time.
@@ -26,7 +26,7 @@ pub(super) enum Next {
 
 /// Counts the silence.
 #[derive(Clone, Copy, Debug, Default)]
-pub(super) struct Watch {
+pub struct Watch {
     since_asked: Duration,
     /// Since the first question behind the last answer.
     unanswered: Option<Duration>,

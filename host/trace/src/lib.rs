@@ -1,7 +1,7 @@
 #![doc = include_str!("../README.md")]
 //!
 //! A [`TraceRecord`] is one entry of a trace. [`filter`] chooses among them, [`playback`] gives them out at their own times,
-//! [`diff`] compares two traces, [`bits`] knows how long a frame is on the bus, and [`socketcan`] writes events as Linux does.
+//! [`diff`] compares two traces, [`bits`] knows how long a frame is on the bus, [`levels`] how it looks there, and [`socketcan`] writes events as Linux does.
 
 #![forbid(unsafe_code)]
 
@@ -13,6 +13,8 @@ pub mod filter;
 mod frame;
 mod interface;
 mod length;
+pub mod levels;
+pub mod names;
 pub mod playback;
 mod record;
 pub mod socketcan;

@@ -221,6 +221,18 @@ where
         self.steps += 1;
     }
 
+    /// On the way to another place: hands out the next record at once if it is older than a time, whatever the speed. `None` once
+    /// the trace is there; what follows is due as if it had come there by itself.
+    pub fn forward_to(&mut self, time_ns: i64, now: Duration) -> Option<TraceRecord> {
+        if let Some(record) = self.next.filter(|record| record.time_ns < time_ns) {
+            self.take(record);
+            return Some(record);
+        }
+        let limit = self.next.map(|record| record.time_ns).or(self.last_ns);
+        self.anchor(limit.map_or(time_ns, |limit_ns| limit_ns.min(time_ns)), now);
+        None
+    }
+
     /// Whether the trace begins anew after its end.
     pub fn is_looped(&self) -> bool {
         self.looped
@@ -367,6 +379,28 @@ mod tests {
         assert_eq!(due(&mut playback, 500), (vec![0], Due::Wait(ms(1000))));
         assert_eq!(due(&mut playback, 1499), (vec![], Due::Wait(ms(1))));
         assert_eq!(due(&mut playback, 1500), (vec![3_600_000], Due::Ended));
+    }
+
+    #[test]
+    fn another_place_is_reached_at_once_and_from_there_it_goes_on_in_time() {
+        let mut playback = playing(&[0, 10, 30, 100, 200]);
+        assert_eq!(due(&mut playback, 500).0, [0]);
+        playback.pause(ms(500));
+        let mut times = Vec::new();
+        while let Some(record) = playback.forward_to(at(50).time_ns, ms(510)) {
+            times.push((record.time_ns - at(0).time_ns) / MS);
+        }
+        assert_eq!((times, playback.position_ns(ms(510))), (vec![10, 30], at(50).time_ns));
+        assert_eq!(due(&mut playback, 900), (vec![], Due::Paused));
+        playback.resume(ms(1000));
+        assert_eq!(due(&mut playback, 1000), (vec![], Due::Wait(ms(50))));
+        assert_eq!(due(&mut playback, 1050), (vec![100], Due::Wait(ms(100))));
+        // Beyond its end it is at its end.
+        while playback.forward_to(at(9999).time_ns, ms(1060)).is_some() {}
+        assert_eq!(
+            (playback.position_ns(ms(1060)), due(&mut playback, 1060).1),
+            (at(200).time_ns, Due::Ended)
+        );
     }
 
     #[test]

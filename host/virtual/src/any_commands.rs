@@ -8,11 +8,10 @@
 #[path = "../../../tests/arbitrary/mod.rs"]
 mod arbitrary;
 
-use std::cell::OnceCell;
 use std::io::Write;
+use std::slice::IterMut;
 use std::sync::Arc;
 
-use cantap_firmware::bus::queue::RecordQueue;
 use cantap_wire::framing::{self, CRC_LEN, MAX_REQUEST, max_encoded_len};
 use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Status};
 use cantap_wire::record::LossStage;
@@ -25,7 +24,7 @@ use proptest::prelude::*;
 use self::arbitrary::{channel_config, command};
 use super::Options;
 use super::board::{Dtr, VirtualPort};
-use super::machine::{Machine, Witness, World};
+use super::machine::{Machine, Memory, Witness, World};
 use crate::simbus::Frames;
 use cantap::device::{PipeReader, PipeWriter, pipe};
 
@@ -156,8 +155,8 @@ struct Books {
 
 /// A host and its device.
 struct Rig<'q> {
-    queues: &'q [OnceCell<Box<RecordQueue>>; LIVES],
-    lives: usize,
+    /// For each life of the firmware.
+    memories: IterMut<'q, Option<Box<Memory>>>,
     machine: Option<Machine<'q>>,
     from_device: PipeReader,
     to_device: PipeWriter,
@@ -176,15 +175,14 @@ struct Rig<'q> {
 }
 
 impl<'q> Rig<'q> {
-    fn new(queues: &'q [OnceCell<Box<RecordQueue>>; LIVES], mut options: Options) -> Self {
+    fn new(memories: &'q mut [Option<Box<Memory>>; LIVES], mut options: Options) -> Self {
         let (from_device, to_host) = pipe(PIPE_BYTES);
         let (from_host, to_device) = pipe(PIPE_BYTES);
         let (open, witness) = (Arc::new(Dtr::new(true)), Arc::new(Witness::default()));
         let port = VirtualPort::new(from_host, to_host, Arc::clone(&open));
         let world = World::new(&mut options, port, Arc::clone(&witness));
         let mut rig = Self {
-            queues,
-            lives: 0,
+            memories: memories.iter_mut(),
             machine: None,
             from_device,
             to_device,
@@ -203,9 +201,8 @@ impl<'q> Rig<'q> {
     }
 
     fn power_up(&mut self, world: World) {
-        let queue = self.queues[self.lives].get_or_init(|| Box::new(RecordQueue::new()));
-        self.lives += 1;
-        self.machine = Some(Machine::power_up(queue, world));
+        let memory = self.memories.next().expect("no sequence has more lives").insert(Memory::new());
+        self.machine = Some(Machine::power_up(memory, world));
     }
 
     /// What was under way comes to nothing.
@@ -302,14 +299,14 @@ impl<'q> Rig<'q> {
     fn await_answer(&mut self, command: Command) -> Result<Option<Response>, TestCaseError> {
         self.reads = true;
         self.answers.clear();
-        let (what, lives) = (format!("{command:?}"), self.lives);
+        let (what, lives_left) = (format!("{command:?}"), self.memories.len());
         let id = self.ask(command);
         for _ in 0..PATIENCE_MS {
             self.step();
             if let Some(at) = self.answers.iter().position(|answer| answer.id == id) {
                 return Ok(Some(self.answers.swap_remove(at)));
             }
-            if self.lives != lives {
+            if self.memories.len() != lives_left {
                 return Ok(None);
             }
         }
@@ -350,7 +347,7 @@ impl<'q> Rig<'q> {
             Action::Greet => self.greet()?,
             Action::Balance => self.balance()?,
             Action::End(command) => {
-                if self.lives < LIVES {
+                if self.memories.len() > 0 {
                     self.ask(*command);
                     self.pass(60);
                 }
@@ -454,8 +451,8 @@ proptest! {
         configs in [prop::option::weighted(0.9, channel_config()), prop::option::weighted(0.9, channel_config())],
         actions in prop::collection::vec(action(), 1..24),
     ) {
-        let queues: [OnceCell<Box<RecordQueue>>; LIVES] = Default::default();
-        let mut rig = Rig::new(&queues, options);
+        let mut memories: [Option<Box<Memory>>; LIVES] = Default::default();
+        let mut rig = Rig::new(&mut memories, options);
         rig.greet()?;
         for (channel, config) in Channel::ALL.into_iter().zip(configs) {
             if config.is_some() {

@@ -16,6 +16,7 @@ use cantap_wire::message::Failures;
 use cantap_wire::{CHANNELS, Channel};
 
 use super::controller::{ControlSide, Controller, TrafficSide};
+use super::edges::VirtualMeter;
 use super::flash::Flash;
 use cantap::device::{PipeReader, PipeWriter};
 
@@ -59,7 +60,7 @@ impl ModelClock {
     }
 
     /// The stamp timer at a model time.
-    fn ticks_at(&self, now_ns: u64) -> u64 {
+    pub fn ticks_at(&self, now_ns: u64) -> u64 {
         let since_ns = u128::from(now_ns.saturating_sub(self.started_ns));
         (since_ns * u128::from(self.ticks_per_gs) / GS_NS) as u64
     }
@@ -176,11 +177,13 @@ impl Chip for VirtualChip {
 pub struct Filters(pub [Rc<RefCell<Controller>>; CHANNELS]);
 
 impl FilterBanks for Filters {
-    fn write(&mut self, layout: &Layout) {
+    fn write(&mut self, layout: &Layout) -> bool {
         let (first, second) = layout.banks.split_at(usize::from(layout.split));
+        let mut differed = false;
         for (controller, banks) in self.0.iter().zip([first, second]) {
-            controller.borrow_mut().set_filters(banks.iter().flatten().copied().collect());
+            differed |= controller.borrow_mut().set_filters(banks.iter().flatten().copied().collect());
         }
+        differed
     }
 }
 
@@ -192,6 +195,7 @@ pub struct VirtualBoard<'q> {
     pub clock: ModelClock,
     pub filters: Filters,
     pub chip: VirtualChip,
+    pub meter: VirtualMeter,
 }
 
 impl<'q> Board<'q, QUEUE_BYTES> for VirtualBoard<'q> {
@@ -200,6 +204,7 @@ impl<'q> Board<'q, QUEUE_BYTES> for VirtualBoard<'q> {
     type Clock = ModelClock;
     type Filters = Filters;
     type Chip = VirtualChip;
+    type Meter = VirtualMeter;
 
     fn with_capture<R>(
         &mut self,
@@ -226,6 +231,10 @@ impl<'q> Board<'q, QUEUE_BYTES> for VirtualBoard<'q> {
 
     fn chip(&mut self) -> &mut VirtualChip {
         &mut self.chip
+    }
+
+    fn meter(&mut self) -> &mut VirtualMeter {
+        &mut self.meter
     }
 }
 

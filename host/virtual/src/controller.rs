@@ -109,8 +109,11 @@ impl Controller {
         matches!(self.mode(), Some(Mode::Loopback | Mode::SilentLoopback))
     }
 
-    pub fn set_filters(&mut self, filters: Vec<Bank>) {
+    /// Returns whether they were others.
+    pub fn set_filters(&mut self, filters: Vec<Bank>) -> bool {
+        let differed = self.filters != filters;
         self.filters = filters;
+        differed
     }
 
     /// Called as time passes: ends bus-off when its time is over.

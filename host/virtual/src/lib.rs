@@ -16,6 +16,7 @@ mod board;
 pub mod car;
 mod check;
 mod controller;
+mod edges;
 mod flash;
 mod log;
 mod machine;

@@ -7,8 +7,9 @@ use std::sync::atomic::{AtomicU64, Ordering};
 
 use cantap_firmware::bus::capture::Capture;
 use cantap_firmware::bus::queue::RecordQueue;
+use cantap_firmware::bus::transmit::TxQueue;
 use cantap_firmware::port::command::Identity;
-use cantap_firmware::port::session::Session;
+use cantap_firmware::port::session::{self, Session};
 use cantap_firmware::ports::Clock;
 use cantap_wire::{CHANNELS, Channel};
 use heapless::String;
@@ -16,7 +17,9 @@ use heapless::String;
 use super::board::{
     Ending, FRAME_NS, Filters, ModelClock, TICK_PHASE_NS, VirtualBoard, VirtualChip, VirtualPort,
 };
+use super::car;
 use super::controller::{ControlSide, Controller, TrafficSide};
+use super::edges::VirtualMeter;
 use super::flash::Flash;
 use super::options::Options;
 use crate::simbus::{Node, Schedule, SimBus, Traffic};
@@ -51,6 +54,25 @@ impl Witness {
     }
 }
 
+/// The memory that the firmware is given at its start.
+pub struct Memory {
+    records: RecordQueue,
+    transmit: [TxQueue; CHANNELS],
+    session: session::Memory,
+}
+
+impl Memory {
+    /// As after power-on.
+    #[expect(clippy::large_stack_arrays, reason = "a computer's stack has room for them")]
+    pub fn new() -> Box<Self> {
+        Box::new(Self {
+            records: RecordQueue::new(),
+            transmit: [const { TxQueue::new() }; CHANNELS],
+            session: session::Memory::new(),
+        })
+    }
+}
+
 /// What outlives the firmware.
 pub struct World {
     port: VirtualPort,
@@ -60,6 +82,7 @@ pub struct World {
     witness: Arc<Witness>,
     flash: Flash,
     serial: String<24>,
+    name: &'static str,
     crystal_ppm: f64,
     now_ns: u64,
 }
@@ -76,6 +99,7 @@ impl World {
             flash: Flash::new(options.settings.clone()),
             // Cannot fail: longer ones are refused.
             serial: String::try_from(options.serial.as_str()).unwrap_or_default(),
+            name: if options.car { car::BOARD } else { "virtual" },
             crystal_ppm: options.crystal_ppm,
             now_ns: 0,
         }
@@ -95,6 +119,7 @@ pub struct Machine<'q> {
     joined: bool,
     witness: Arc<Witness>,
     serial: String<24>,
+    name: &'static str,
     crystal_ppm: f64,
     /// What it reported of earlier firmwares' controllers.
     heard_before: Heard,
@@ -104,23 +129,25 @@ pub struct Machine<'q> {
 }
 
 impl<'q> Machine<'q> {
-    /// The firmware starts, with an empty queue and nothing open.
-    pub fn power_up(queue: &'q RecordQueue, world: World) -> Self {
-        let World { port, buses, loops, joined, witness, flash, serial, crystal_ppm, now_ns } = world;
+    /// The firmware starts in new memory, with nothing open.
+    pub fn power_up(memory: &'q mut Memory, world: World) -> Self {
+        let World { port, buses, loops, joined, witness, flash, serial, name, crystal_ppm, now_ns } = world;
         let controllers = [(); CHANNELS].map(|()| Rc::new(RefCell::new(Controller::new())));
-        let (producer, consumer) = queue.split();
-        let identity = Identity { board: "virtual", serial: serial.clone() };
+        let Memory { records, transmit, session } = memory;
+        let (producer, consumer) = records.split();
+        let identity = Identity { board: name, serial: serial.clone() };
         let side = |channel: usize| Rc::clone(&controllers[channel]);
         Self {
             board: VirtualBoard {
-                capture: Capture::new(producer),
+                capture: Capture::new(producer, transmit),
                 traffic: [TrafficSide(side(0)), TrafficSide(side(1))],
                 control: [ControlSide(side(0)), ControlSide(side(1))],
                 clock: ModelClock::started_at(now_ns, crystal_ppm),
                 filters: Filters([side(0), side(1)]),
                 chip: VirtualChip { flash, ending: None },
+                meter: VirtualMeter::default(),
             },
-            session: Session::new(consumer, identity),
+            session: Session::new(consumer, identity, session),
             port,
             buses,
             loops,
@@ -129,6 +156,7 @@ impl<'q> Machine<'q> {
             heard_before: witness.heard(),
             witness,
             serial,
+            name,
             crystal_ppm,
             now_ns,
             next_usb_ns: now_ns,
@@ -138,10 +166,21 @@ impl<'q> Machine<'q> {
 
     /// The firmware is gone; buses, port and flash remain.
     pub fn power_down(self) -> World {
-        let Self { board, port, buses, loops, joined, witness, serial, crystal_ppm, now_ns, .. } = self;
+        let Self { board, port, buses, loops, joined, witness, serial, name, crystal_ppm, now_ns, .. } = self;
         // What it had not read is lost with it.
         while port.from_host.take(&mut [0; 64]) > 0 {}
-        World { port, buses, loops, joined, witness, flash: board.chip.flash, serial, crystal_ppm, now_ns }
+        World {
+            port,
+            buses,
+            loops,
+            joined,
+            witness,
+            flash: board.chip.flash,
+            serial,
+            name,
+            crystal_ppm,
+            now_ns,
+        }
     }
 
     /// Hangs the device on a USB host whose time is so far ahead of model time: its frames are whole milliseconds of it.
@@ -189,6 +228,7 @@ impl<'q> Machine<'q> {
         for index in 0..2 * CHANNELS {
             self.with_bus(index, |bus, nodes| bus.step(now_ns, nodes));
         }
+        self.pass_edges();
         self.interrupt();
         if self.board.clock.alarm_ns() <= now_ns {
             self.board.clock.clear_alarm();
@@ -210,6 +250,17 @@ impl<'q> Machine<'q> {
         }
     }
 
+    /// Lets the meter see the edges of the pin that it watches.
+    fn pass_edges(&mut self) {
+        let watched = self.board.meter.watched().map(|channel| if self.joined { 0 } else { channel.index() });
+        for (index, bus) in self.buses.iter_mut().enumerate() {
+            bus.watch(watched == Some(index));
+            while let Some(edge) = bus.pass_edge(self.now_ns) {
+                self.board.meter.edge(self.board.clock.ticks_at(edge.at_ns) as u32, edge.dominant);
+            }
+        }
+    }
+
     /// Serves the interrupts that controllers ask for, at once.
     fn interrupt(&mut self) {
         let Self { board, controllers, witness, heard_before, .. } = self;
@@ -226,7 +277,7 @@ impl<'q> Machine<'q> {
                 board.capture.on_receive(channel, &mut board.traffic[index], &board.clock, entered);
             }
             if interrupts.transmit {
-                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, entered);
+                board.capture.on_transmit(channel, &mut board.traffic, &board.clock, Some(entered));
             }
             if interrupts.error {
                 board.capture.on_error(channel, &mut board.traffic[index], entered);

@@ -5,10 +5,8 @@ use std::sync::{Arc, OnceLock};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-use cantap_firmware::bus::queue::RecordQueue;
-
 use super::board::{Dtr, Ending, VirtualPort};
-use super::machine::{Machine, Witness, World};
+use super::machine::{Machine, Memory, Witness, World};
 use super::options::{Options, Pace};
 use cantap::device::{Link, PipeReader, PipeWriter, pipe};
 use cantap::{Device, DeviceError};
@@ -113,8 +111,8 @@ fn run(mut options: Options, port: VirtualPort, witness: Arc<Witness>, after: Af
     let pace = options.pace;
     let mut world = World::new(&mut options, port, witness);
     loop {
-        let queue = Box::new(RecordQueue::new());
-        let mut machine = Machine::power_up(&queue, world);
+        let mut memory = Memory::new();
+        let mut machine = Machine::power_up(&mut memory, world);
         let is_over = |machine: &Machine<'_>| {
             quit.load(Ordering::Relaxed) || machine.ending().is_some() || machine.port().to_host.is_closed()
         };

@@ -12,7 +12,7 @@ use crate::probe::{Change, Probe};
 use crate::profile::Profile;
 use crate::rom::{self, Start};
 use crate::soc::rcc::{CRYSTAL_START_US, Crystal, ResetCause};
-use crate::soc::{Board, SharedBoard, bootloader};
+use crate::soc::{Board, RECEIVE_PINS, SharedBoard, bootloader};
 use crate::stop::{Reason, Stopped};
 use crate::timing::Bound;
 use crate::trace::Trace;
@@ -36,6 +36,8 @@ pub struct Setup {
     pub start: Start,
     /// The interrupts whose masking is measured: bit n is interrupt n.
     pub watched: u128,
+    /// Where each bus arrives: port (0 for A) and pin.
+    pub receive_pins: [(usize, u32); 2],
     /// Both controllers on one bus.
     pub joined: bool,
     /// A reset that the firmware asks for ends the run, rather than restarting it.
@@ -59,6 +61,7 @@ impl Setup {
             crystal: Crystal { hz: crystal_hz, start_us: Some(CRYSTAL_START_US) },
             start: Start::PowerOn,
             watched: 0,
+            receive_pins: RECEIVE_PINS,
             joined: false,
             stop_on_reset: false,
             survive_watchdog: false,
@@ -104,6 +107,7 @@ impl Machine {
         }
         let mut board = Board::new(&memories, setup.clock, setup.crystal);
         board.can.set_master_reset(setup.master_reset);
+        board.receive_at(setup.receive_pins);
         if setup.joined {
             board.wires = [Wire::new(&[0, 1]), Wire::new(&[])];
         }

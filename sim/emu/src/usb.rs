@@ -20,7 +20,7 @@ impl UsbPort {
 }
 
 impl<D: HostDriver> UsbPort<D> {
-    /// The same, with a driver of somebody else's.
+    /// The same, with another driver.
     pub fn with_driver(timing: Timing, driver: D) -> Self {
         Self { otg: Otg::new(), host: UsbHost::new(timing, driver) }
     }

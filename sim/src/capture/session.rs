@@ -30,7 +30,7 @@ impl Session {
         Self { decoder: Decoder::new(), next_id: 1, responses: Vec::new(), corruptions: Vec::new(), bytes: 0 }
     }
 
-    /// The bytes of a request, and its id. A zero goes in front: it ends what somebody else may have
+    /// The bytes of a request, and its id. A zero goes in front: it ends what another program may have
     /// left in the device's input and chooses the native protocol.
     pub fn request(&mut self, command: Command) -> (u16, Vec<u8>) {
         let id = self.next_id;

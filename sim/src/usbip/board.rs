@@ -52,7 +52,7 @@ impl Source for First {
 /// Everything that is counted, since the board was made or since a mark.
 #[derive(Clone, Copy, Debug)]
 pub struct Figures {
-    /// Of the wall's clock.
+    /// By the wall clock.
     pub at: Instant,
     /// Core cycles.
     pub cycles: u64,

@@ -23,9 +23,9 @@ const SLICE: u64 = 100 * CYCLES_PER_US;
 const SLICE_WALL: Duration = Duration::from_nanos(SLICE * 1_000_000_000 / CYCLES_PER_SECOND);
 /// How long to wait for a kernel that owes reads before looking again.
 const STARVED_WAIT: Duration = Duration::from_millis(20);
-/// Emulated time ahead of the wall's clock by less is not worth a wait.
+/// Emulated time ahead of the wall clock by less is not worth a wait.
 const LEAST_WAIT: Duration = Duration::from_millis(1);
-/// How far the emulation may lag behind the wall's clock before it gives the difference up.
+/// How far the emulation may lag behind the wall clock before it gives the difference up.
 const MOST_BEHIND: Duration = Duration::from_millis(100);
 /// Linux' ECONNRESET: a transfer was taken back.
 const ECONNRESET: i32 = -104;

@@ -174,7 +174,7 @@ impl Registers {
     /// Reads a register; of some, the next value differs.
     #[inline]
     pub fn read(&self, offset: usize) -> u32 {
-        // SAFETY: an aligned address within OTG_FS's 256 KiB, since all offsets are from this file; whoever has `self` is alone.
+        // SAFETY: an aligned address within OTG_FS's 256 KiB, since all offsets are from this file; there is only one `self`.
         unsafe { Self::at(offset).read_volatile() }
     }
 

@@ -14,6 +14,9 @@ pub const DEVICE_TAG: u32 = 0xFFFF_0000;
 /// See [`DEVICE_TAG`].
 pub const TRIGGER_TAG: u32 = 0xFFFF_8000;
 
+/// Never from a device: the tag of what another client of a shared board has sent.
+pub const OTHERS_TAG: u32 = u32::MAX;
+
 /// A frame to be sent.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, Serialize, Deserialize)]
 pub struct TxFrame {

@@ -1,8 +1,8 @@
 //! One or more of every variant that crosses USB, with its bytes: what the tests pin and what `vectors.json` holds.
 
 use cantap_wire::message::{
-    ChannelConfig, ChannelStatus, Checksum, Defaults, Failures, Filter, FrameKind, Modifier, Periodic,
-    RegisterSet, Registers, Status, Trigger, TxFrame, capability,
+    ChannelConfig, ChannelStatus, Checksum, Defaults, Edge, Edges, Failures, Filter, FrameKind, Modifier,
+    Periodic, RegisterSet, Registers, Role, Status, Trigger, TxFrame, capability,
 };
 use cantap_wire::record::{BusErrorKind, ErrorState, LossStage, TransmitFailure};
 use cantap_wire::{BitTiming, Channel, Command, Event, Frame, Hello, Refusal, Reply};
@@ -80,7 +80,7 @@ pub fn commands() -> Vec<(Command, &'static str)> {
     };
     let tx = |tag, at_ticks| TxFrame { tag, frame, at_ticks };
     vec![
-        (Command::Hello { protocol: 3 }, "00 03"),
+        (Command::Hello { protocol: 4 }, "00 04"),
         (Command::Open { channel, config: None }, "01 01 00"),
         (Command::Open { channel, config: Some(config) }, "01 01 01 ac 02 0d 02 01 00 01 00 00 00"),
         (Command::Close { channel }, "02 01"),
@@ -112,6 +112,9 @@ pub fn commands() -> Vec<(Command, &'static str)> {
         (Command::Configure { channel, config }, "11 01 ac 02 0d 02 01 00 01 00 00 00"),
         (Command::Defaults { channel }, "12 01"),
         (Command::Failures, "13"),
+        (Command::MeasureEdges { channel: None }, "14 00"),
+        (Command::MeasureEdges { channel: Some(channel) }, "14 01 01"),
+        (Command::Edges, "15"),
     ]
 }
 
@@ -121,7 +124,7 @@ pub fn replies() -> Vec<(Reply, &'static str)> {
         ChannelConfig { manual_recovery: true, omit_data: true, ..ChannelConfig::listen_only(TIMING) };
     let filter = Filter { extended: true, kind: FrameKind::Remote, id: 300, mask: 1 };
     let hello = Hello {
-        protocol: 3,
+        protocol: 4,
         firmware: [0, 1, 300],
         board: "ab".try_into().unwrap(),
         serial: "c".try_into().unwrap(),
@@ -172,11 +175,15 @@ pub fn replies() -> Vec<(Reply, &'static str)> {
         supply_millivolts: None,
         channels: [closed, open],
     };
+    let edges = [
+        Edge { ticks: 300, dominant: true, unsure: true },
+        Edge { ticks: 12, dominant: false, unsure: false },
+    ];
     let set = RegisterSet { mcr: 1, msr: 2, tsr: 3, rf0r: 4, ier: 5, esr: 6, btr: 7 };
     vec![
         (
             Reply::Hello(hello),
-            "00 03 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
+            "00 04 00 01 ac 02 02 61 62 01 63 02 80 b6 dc 05 80 a2 95 11 80 80 06 80 02 20 08 1c 11",
         ),
         (Reply::Done, "01"),
         (Reply::Opened(config), "02 ac 02 0d 02 01 00 00 01 01 00"),
@@ -198,6 +205,11 @@ pub fn replies() -> Vec<(Reply, &'static str)> {
             "08 ac 02 0d 02 01 00 00 01 01 00 01 01 01 ac 02 01",
         ),
         (Reply::Failures(Failures { count: 300, last: "ab".try_into().unwrap() }), "09 ac 02 02 61 62"),
+        (Reply::Edges(Edges { ticks: 300, dominant: false, edges: heapless::Vec::new() }), "0a ac 02 00 00"),
+        (
+            Reply::Edges(Edges { ticks: 300, dominant: true, edges: edges.into_iter().collect() }),
+            "0a ac 02 01 02 ac 02 01 01 0c 00 00",
+        ),
     ]
 }
 
@@ -224,5 +236,10 @@ pub fn refusals() -> Vec<(Refusal, &'static str)> {
         (Refusal::Hardware, "11"),
         (Refusal::NothingSaved, "12"),
         (Refusal::NotBusOff, "13"),
+        (Refusal::NotMeasuring, "14"),
+        (Refusal::NotGranted { needs: Role::Send }, "15 02"),
+        (Refusal::Held, "16"),
+        (Refusal::OtherSettings, "17"),
+        (Refusal::NoBoard, "18"),
     ]
 }

@@ -15,6 +15,7 @@ use cantap_wire::Channel;
 use cantap_wire::Channel::{Can1, Can2};
 
 use super::extent::Extent;
+use super::tasks;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;
@@ -77,6 +78,16 @@ pub fn run(extent: &Extent) -> Result<()> {
             let filled: Option<Vec<Filled>> = stream::fill(rig, other.channels(), kind, seconds)?;
             Ok([greatest(filled.as_deref(), |one| -one.load_percent, |load| format!("{:.2}", -load))])
         })?;
+    }
+    if extent.wants("tasks") {
+        tasks::print(
+            "both channels streamed, no data",
+            |bound| rig(Other::Joined, bound),
+            |rig| {
+                stream::fill(rig, &Channel::ALL, Kind::Std0, seconds)?.context("a frame is missing")?;
+                Ok(())
+            },
+        )?;
     }
     Ok(())
 }

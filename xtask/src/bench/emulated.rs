@@ -5,7 +5,6 @@ use std::time::Instant;
 
 use anyhow::{Context, Result, ensure};
 use cantap_emu::machine::Setup;
-use cantap_emu::profile::Table;
 use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::Timing;
@@ -16,6 +15,7 @@ use cantap_sim::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_wire::Channel;
 
 use super::extent::Extent;
+use super::tasks;
 use crate::board::Board;
 
 const BITRATE_BPS: u32 = 1_000_000;
@@ -27,8 +27,6 @@ const LOAD_MS: u64 = 500;
 const STALL_MS: u64 = 1_600;
 /// Frames before the stall.
 const BEFORE_STALL_MS: u64 = 100;
-/// Functions that cost less of the processor are not listed.
-const LEAST_PERCENT: f64 = 0.2;
 
 /// Measures loads, then a host that stalls.
 pub fn run(extent: &Extent) -> Result<()> {
@@ -55,7 +53,14 @@ pub fn run(extent: &Extent) -> Result<()> {
     }
     for (name, channels) in [("tasks ×1", &Channel::ALL[..1]), ("tasks ×2", &Channel::ALL[..])] {
         if extent.wants(name) {
-            tasks(channels, ms)?;
+            let prepare = |bound| {
+                let mut rig = loaded(Kind::Std0, channels, ms, bound)?;
+                rig.run_for(MS)?;
+                Ok(rig)
+            };
+            tasks::print(&format!("std0 ×{}", channels.len()), prepare, |rig| {
+                Ok(rig.run_for(ms * MS - MS)?)
+            })?;
         }
     }
     if extent.wants("stall") {
@@ -154,35 +159,6 @@ fn load(name: &str, kind: Kind, channels: &[Channel], ms: u64) -> Result<Load> {
     Ok(measured)
 }
 
-/// Prints where the processor's time goes at the worst load on `channels`: by interrupt, and at worst by function.
-fn tasks(channels: &[Channel], ms: u64) -> Result<()> {
-    println!("processor by interrupt, std0 ×{}, % of the time: at best / at worst", channels.len());
-    let mut shares = Vec::new();
-    let mut functions = String::new();
-    for bound in Bound::ALL {
-        let mut rig = loaded(Kind::Std0, channels, ms, bound)?;
-        rig.run_for(MS)?;
-        rig.machine.reset_probe();
-        rig.machine.start_profile();
-        rig.run_for(ms * MS - MS)?;
-        let machine = &mut rig.machine;
-        let profile = machine.take_profile().context("it was started")?;
-        let span = machine.now() - machine.probe().since();
-        shares.push(machine.tasks(span));
-        let rows = profile.by_function(machine.image());
-        let name_of = &|number| machine.task_name(number);
-        functions = Table { rows: &rows, name_of, span, least_percent: LEAST_PERCENT }.to_string();
-    }
-    let [best, worst] = &shares[..] else { unreachable!("two bounds") };
-    for (task, entries, best) in best {
-        let worst = worst.iter().find(|(name, ..)| name == task).map_or(0.0, |(_, _, share)| *share);
-        println!("  {task:<24} {best:>6.2} / {worst:>5.2}  ({entries} times)");
-    }
-    println!("at worst by function: its own, and waiting for instructions, data in flash, buses, branches");
-    print!("{functions}");
-    Ok(())
-}
-
 /// The host stops reading in the middle of the worst traffic on one channel, and reads again.
 fn stall(bound: Bound) -> Result<()> {
     let channel = Channel::Can1;
@@ -203,7 +179,7 @@ fn stall(bound: Bound) -> Result<()> {
 
     let sent = rig.ledger.on_bus_count(channel) - until_stall;
     let lost = rig.ledger.losses(channel).total();
-    // Frames are 48 µs apart; but for the few after there is room again, those lost are the last ones.
+    // Frames are 48 µs apart; except for the few after there is room again, those lost are the last ones.
     let lost_ms = lost as f64 * 0.048;
     println!("host stall at 100 % of one channel (std0), {STALL_MS} ms, at {bound}:");
     println!(

@@ -4,6 +4,8 @@
 //! need. One file per subject; each has `run()`, which prints its own table.
 
 #[cfg(feature = "bench")]
+mod autobaud;
+#[cfg(feature = "bench")]
 mod bus;
 #[cfg(feature = "bench")]
 mod clock;
@@ -23,6 +25,8 @@ mod monitor;
 mod signals;
 #[cfg(feature = "bench")]
 mod stats;
+#[cfg(feature = "bench")]
+mod tasks;
 #[cfg(feature = "bench")]
 mod wire;
 
@@ -45,6 +49,8 @@ enum Subject {
     Emulated,
     /// Replies, periods, replay and load on the emulated bus.
     Bus,
+    /// The search for a bit rate, by rates, densities and damage.
+    Autobaud,
     /// Device time to UTC, and two boards' times to one another.
     Clock,
     /// Frames per second that the host decodes, tightens and places in time.
@@ -106,6 +112,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run(&extent)?,
             Subject::Bus => bus::run(&extent)?,
+            Subject::Autobaud => autobaud::run(&extent)?,
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,

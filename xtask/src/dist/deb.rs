@@ -46,13 +46,11 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     shell.copy_file("packaging/60-cantap.rules", &rules)?;
     let papers = root.join("usr/share/doc/cantap");
     shell.create_dir(&papers)?;
-    let ours = format!(
-        "cantap {VERSION} is under the MIT licence or the Apache Licence 2.0, as you like.\n\n{}\n{}",
-        shell.read_file("LICENSE-MIT")?,
-        shell.read_file("LICENSE-APACHE")?
-    );
     notices::write(shell, &papers.join("THIRD-PARTY.txt"), &["-p", "cantap-cli"])?;
-    shell.write_file(papers.join("copyright"), ours)?;
+    shell.write_file(papers.join("copyright"), copyright(&shell.read_file("LICENSE-MIT")?))?;
+    let changes = papers.join("changelog");
+    shell.copy_file("CHANGELOG.md", &changes)?;
+    cmd!(shell, "gzip -9n {changes}").run()?;
 
     shell.write_file(root.join("DEBIAN/control"), control(shell, &root, &program, &architecture)?)?;
     shell.copy_file("packaging/postinst", root.join("DEBIAN/postinst"))?;
@@ -80,6 +78,19 @@ fn control(shell: &Shell, root: &Path, program: &Path, architecture: &str) -> Re
     ))
 }
 
+/// Debian's machine-readable form. The Apache licence is on every Debian system; only its place is named.
+fn copyright(mit: &str) -> String {
+    let lines = mit.trim().lines().map(|line| format!(" {}", if line.is_empty() { "." } else { line }));
+    let indented = lines.collect::<Vec<_>>().join("\n");
+    format!(
+        "Format: https://www.debian.org/doc/packaging-manuals/copyright-format/1.0/\nUpstream-Name: cantap\n\
+         Comment: Other people's crates in this program, and their licences, are in THIRD-PARTY.txt.\n\n\
+         Files: *\nCopyright: The cantap developers\nLicense: Expat or Apache-2.0\n\n\
+         License: Expat\n{indented}\n\n\
+         License: Apache-2.0\n The full text is in /usr/share/common-licenses/Apache-2.0.\n"
+    )
+}
+
 /// The newest version among symbols such as `(GLIBC_2.34)`.
 fn newest_glibc(symbols: &str) -> Option<(u32, u32)> {
     let versions = symbols.split("GLIBC_").skip(1).filter_map(|rest| {
@@ -92,6 +103,12 @@ fn newest_glibc(symbols: &str) -> Option<(u32, u32)> {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_licence_text_has_no_empty_line_in_debian_s_form() {
+        let text = copyright("MIT\n\nGranted.\n");
+        assert!(text.contains("License: Expat\n MIT\n .\n Granted.\n\nLicense: Apache-2.0\n"), "{text}");
+    }
 
     #[test]
     fn the_newest_symbol_decides_which_glibc_is_needed() {

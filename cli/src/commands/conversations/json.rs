@@ -4,7 +4,7 @@ use std::io::{self, Write};
 
 use cantap_protocols::{Event, Field, Party, Value};
 
-use super::Seconds;
+use crate::commands::decode::Seconds;
 
 /// Writes the object.
 pub(super) fn write(out: &mut impl Write, event: &Event) -> io::Result<()> {

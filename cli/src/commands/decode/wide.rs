@@ -29,8 +29,9 @@ pub struct Wide {
 
 struct Column {
     channel: u8,
-    /// `Message.Signal`, with its unit.
+    /// `Message.Signal`.
     name: String,
+    unit: String,
     /// The last value, and when it came.
     last: Option<(i64, String)>,
     cadence: Cadence,
@@ -83,12 +84,10 @@ impl Wide {
         let channel = decoded.record.channel;
         let columns = &mut self.columns;
         *self.places.entry((channel, decoded.reference, signal)).or_insert_with(|| {
-            let unit = &reading.signal.unit;
-            let unit = if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
-            let name = format!("{}.{}{unit}", decoded.message.name, reading.label);
             columns.push(Column {
                 channel,
-                name,
+                name: format!("{}.{}", decoded.message.name, reading.label),
+                unit: reading.signal.unit.clone(),
                 last: None,
                 cadence: Cadence::new(decoded.message.cycle_ms),
             });
@@ -129,37 +128,64 @@ impl Wide {
         Ok(())
     }
 
-    /// Writes the table.
-    pub fn finish(mut self, out: &mut impl Write) -> anyhow::Result<()> {
+    /// Gives out the table.
+    pub fn finish(mut self, out: &mut impl Rows) -> anyhow::Result<()> {
         if let Some(due_ns) = self.due_ns {
             // The last values have their line too.
             self.advance(due_ns)?;
         }
         let of_several = self.columns.iter().any(|column| column.channel != self.columns[0].channel);
-        write!(out, "time")?;
-        for Column { channel, name, .. } in &self.columns {
+        let names = self.columns.iter().map(|Column { channel, name, unit, .. }| {
             let name = if of_several { format!("{channel}:{name}") } else { name.clone() };
-            write!(out, ",{}", field(&name))?;
-        }
-        write!(out, "\r\n")?;
+            (name, unit.clone())
+        });
+        out.begin(&names.collect::<Vec<_>>())?;
         let mut file = self.waiting.into_inner().map_err(io::IntoInnerError::into_error)?;
         file.rewind()?;
         for line in BufReader::new(file).lines() {
             let line = line?;
-            let mut cells = 0;
-            for (at, cell) in line.split(SEPARATOR).enumerate() {
-                write!(out, "{}{cell}", if at == 0 { "" } else { "," })?;
-                cells = at;
-            }
-            // Columns that came later.
-            write!(out, "{}\r\n", ",".repeat(self.columns.len() - cells))?;
+            let mut cells = line.split(SEPARATOR);
+            let time_ns = cells.next().and_then(|time| time.parse().ok()).unwrap_or_default();
+            // Then columns that came later.
+            let cells = cells.chain(std::iter::repeat("")).take(self.columns.len());
+            out.row(time_ns, cells)?;
         }
         Ok(())
     }
 }
 
+/// Takes a table.
+pub trait Rows {
+    /// The columns' names and units.
+    fn begin(&mut self, names_and_units: &[(String, String)]) -> anyhow::Result<()>;
+    /// A row: a number or nothing for each column.
+    fn row<'a>(&mut self, time_ns: i64, cells: impl Iterator<Item = &'a str>) -> anyhow::Result<()>;
+}
+
+/// A table as CSV.
+pub struct Csv<W>(pub W);
+
+impl<W: Write> Rows for Csv<W> {
+    fn begin(&mut self, names_and_units: &[(String, String)]) -> anyhow::Result<()> {
+        write!(self.0, "time")?;
+        for (name, unit) in names_and_units {
+            let unit = if unit.is_empty() { String::new() } else { format!(" [{unit}]") };
+            write!(self.0, ",{}", field(&format!("{name}{unit}")))?;
+        }
+        Ok(write!(self.0, "\r\n")?)
+    }
+
+    fn row<'a>(&mut self, time_ns: i64, cells: impl Iterator<Item = &'a str>) -> anyhow::Result<()> {
+        write!(self.0, "{}", Seconds(time_ns))?;
+        for cell in cells {
+            write!(self.0, ",{cell}")?;
+        }
+        Ok(write!(self.0, "\r\n")?)
+    }
+}
+
 fn write_line(out: &mut impl Write, time_ns: i64, cells: &[&str]) -> io::Result<()> {
-    write!(out, "{}", Seconds(time_ns))?;
+    write!(out, "{time_ns}")?;
     for cell in cells {
         write!(out, "{SEPARATOR}{cell}")?;
     }

@@ -10,7 +10,7 @@ use crate::address::Address;
 use crate::args::Channels;
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::live::LiveRecords;
+use crate::live::{LiveRecords, unasked};
 use crate::stderr;
 
 /// How long after its end a window is closed, so that what is still on the way gets into it.
@@ -26,7 +26,7 @@ pub(super) fn open(
     time: Option<Duration>,
 ) -> anyhow::Result<LiveRecords> {
     let boards = Boards::new(devices, channels)
-        .map_err(|error| error.context("without a trace to measure, a device is listened to"))?;
+        .map_err(|error| unasked(error, devices, "without a trace to measure"))?;
     LiveRecords::listen(&boards, bitrates, time)
 }
 

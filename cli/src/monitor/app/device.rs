@@ -4,7 +4,8 @@ use cantap::wire::message::Mode;
 use cantap_analysis::stats::Statistics;
 
 use super::super::model::{LOAD_WINDOW, Model};
-use super::super::source::{Order, Plan};
+use super::super::order::Order;
+use super::super::plan::Plan;
 use super::line::PromptKind;
 use super::state::App;
 use crate::address::{Address, AddressError};

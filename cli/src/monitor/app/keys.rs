@@ -2,11 +2,14 @@
 
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
-use super::super::model::Model;
-use super::super::source::{Order, Plan};
-use super::super::views::{self, trace};
+use super::super::event_text::candump_line;
+use super::super::model::{Model, SourceState};
+use super::super::order::Order;
+use super::super::plan::Plan;
 use super::line::PromptKind;
+use super::scroll::first_row;
 use super::state::{App, Direction, Flow, View};
+use super::wish::Wish;
 
 /// The row where a page's own rows begin, its heading.
 const BODY_ROW: u16 = 2;
@@ -33,25 +36,37 @@ impl App {
             return Flow::GoOn;
         }
         if self.help {
-            self.help = false;
+            let page = 10;
+            match key.code {
+                KeyCode::Up => self.help_first = self.help_first.saturating_sub(1),
+                KeyCode::Down => self.help_first += 1,
+                KeyCode::PageUp => self.help_first = self.help_first.saturating_sub(page),
+                KeyCode::PageDown => self.help_first += page,
+                _ => self.help = false,
+            }
+            if self.help {
+                return Flow::GoOn;
+            }
             return if key.code == KeyCode::Char('q') { Flow::Quit } else { Flow::GoOn };
         }
         match key.code {
             KeyCode::Char('q') => return Flow::Quit,
-            KeyCode::Char('h' | '?') | KeyCode::F(1) => self.help = true,
+            KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
             KeyCode::Char(digit @ '1'..='7') => self.show(View::ALL[digit as usize - '1' as usize]),
             KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
             KeyCode::BackTab => {
                 self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
             }
             KeyCode::Char(' ') if self.view == View::Send => self.toggle_sending(),
+            KeyCode::Char(' ') if matches!(model.source, SourceState::Playing(_)) => {
+                self.toggle_playback(model);
+            }
             KeyCode::Char(' ') => self.pause(model),
             KeyCode::Char('c') => self.clear(model),
             KeyCode::Char('t') => self.time_mode = self.time_mode.next(),
-            KeyCode::Char('/') => {
-                self.show(View::Trace);
-                self.ask(PromptKind::Search, "");
-            }
+            KeyCode::Char('/') if self.can_search() => self.ask(PromptKind::Search, ""),
+            KeyCode::Char('n') if self.can_search() => self.find(model, Direction::Back),
+            KeyCode::Char('N') if self.can_search() => self.find(model, Direction::Forward),
             KeyCode::Char('f') => {
                 let filters: Vec<_> = model.history.filters().iter().map(ToString::to_string).collect();
                 self.ask(PromptKind::Filter, &filters.join(" "));
@@ -68,7 +83,17 @@ impl App {
             KeyCode::Char('m') => self.toggle_mode(),
             KeyCode::Char(',') => self.order(Order::Slower),
             KeyCode::Char('.') => self.order(Order::Faster),
-            KeyCode::Char('p') => self.order(Order::TogglePause),
+            KeyCode::Char('p') => self.toggle_playback(model),
+            KeyCode::Char('[') => self.seek_by(-1, model),
+            KeyCode::Char(']') => self.seek_by(1, model),
+            KeyCode::Char('T') => self.ask(PromptKind::Time, ""),
+            KeyCode::Char('B') => self.bookmark(model),
+            KeyCode::Char('{') => self.go_to_bookmark(false, model),
+            KeyCode::Char('}') => self.go_to_bookmark(true, model),
+            KeyCode::Char('O') => self.ask(PromptKind::Open, ""),
+            KeyCode::Char('w') => self.wish = Some(Wish::Next),
+            KeyCode::Char('W') => self.wish = Some(Wish::Close),
+            KeyCode::Char('R') => self.order(Order::Recover),
             KeyCode::Char('>') => self.order(Order::Step),
             KeyCode::Char('l') => self.order(Order::ToggleLoop),
             code => self.page_key(code, model),
@@ -90,10 +115,10 @@ impl App {
     /// Keys that mean something on this page only.
     fn page_key(&mut self, code: KeyCode, model: &mut Model) {
         match (self.view, code) {
-            (View::Trace, KeyCode::Char('n')) => self.find(model, Direction::Back),
-            (View::Trace, KeyCode::Char('N')) => self.find(model, Direction::Forward),
             (View::Trace, KeyCode::Char('y')) => self.copy(model),
+            (View::Trace, KeyCode::Enter) => self.record_opened = !self.record_opened,
             (View::Trace, code) => self.scroll_trace(code, model),
+            (View::Fixed, KeyCode::Enter) => self.open_row(),
             (View::Fixed, KeyCode::Char('s')) => self.sort = self.sort.next(),
             (View::Fixed, KeyCode::Char('S')) => self.reverse = !self.reverse,
             (View::Fixed, KeyCode::Char('g')) => self.grouped = !self.grouped,
@@ -103,24 +128,32 @@ impl App {
             (View::Fixed, KeyCode::Char('u')) => self.each_seen(model, |seen| seen.table.unhide()),
             (View::Fixed, KeyCode::Char(key @ ('x' | 'o'))) => self.mark_row(key == 'x', model),
             (View::Signals, KeyCode::Enter) => {
-                if let Some(row) = self.signal_order.get(self.selected).copied() {
-                    self.each_seen(model, |seen| seen.signals.toggle(row));
+                if let Some(row) = self.signal_order.get(self.selected).copied().flatten() {
+                    self.toggle_signal(row, model);
                 }
             }
-            (View::Graph, KeyCode::Char('+') | KeyCode::Up) => {
-                self.graph_span = (self.graph_span / 2.0).max(0.1);
+            (View::Signals, KeyCode::Char('s')) => self.signals.sort = self.signals.sort.next(),
+            (View::Signals, KeyCode::Char('S')) => self.signals.reverse = !self.signals.reverse,
+            (View::Signals, KeyCode::Char('g')) => self.signals.grouped = !self.signals.grouped,
+            (View::Signals, KeyCode::Char('F')) => {
+                let text = self.signals.filter.text().to_owned();
+                self.ask(PromptKind::Signals, &text);
             }
-            (View::Graph, KeyCode::Char('-') | KeyCode::Down) => {
-                self.graph_span = (self.graph_span * 2.0).min(600.0);
-            }
-            (View::Graph, KeyCode::Left) => self.move_graph_cursor(-0.02),
-            (View::Graph, KeyCode::Right) => self.move_graph_cursor(0.02),
-            (View::Graph, KeyCode::Esc) => self.graph_cursor = None,
+            (View::Graph, code) => self.graph.key(code),
             (View::Send, KeyCode::Enter) => self.send_once(),
             (View::Send, KeyCode::Char('a')) => self.ask(PromptKind::Send, ""),
             (View::Send, KeyCode::Char('e')) => self.edit_entry(),
             (View::Send, KeyCode::Char('d') | KeyCode::Delete) => self.delete_entry(),
             (_, code) => self.scroll(code),
+        }
+    }
+
+    /// Shows the signals of the selected row of the fixed view below it, or no more.
+    fn open_row(&mut self) {
+        if let Some(key) = self.fixed_order.get(self.selected).copied()
+            && !self.opened.remove(&key)
+        {
+            self.opened.insert(key);
         }
     }
 
@@ -140,33 +173,63 @@ impl App {
         });
     }
 
+    /// Puts a signal into the graph, or takes it out, in what is shown and in what goes on behind it.
+    fn toggle_signal(&mut self, row: usize, model: &mut Model) {
+        let Model { history, seen, .. } = model;
+        for seen in std::iter::once(seen).chain(self.frozen.as_deref_mut()) {
+            seen.signals.toggle(row, history.all());
+        }
+    }
+
+    /// Sorts by the heading in this column; once more, the other way round.
+    fn click_heading(&mut self, column: u16) {
+        match self.view {
+            View::Fixed => {
+                let found = self.sort_columns.iter().find(|(columns, _)| columns.contains(&column));
+                match found.map(|(_, column)| *column) {
+                    Some(column) if self.sort == column => self.reverse = !self.reverse,
+                    Some(column) => (self.sort, self.reverse) = (column, false),
+                    None => {}
+                }
+            }
+            View::Signals => {
+                let headings = &self.signals.headings;
+                let found = headings.iter().find(|(columns, _)| columns.contains(&column));
+                if let Some(column) = found.map(|(_, column)| *column) {
+                    self.signals.sort_by(column);
+                }
+            }
+            _ => {}
+        }
+    }
+
     fn copy(&mut self, model: &Model) {
         let place = self.cursor.or(model.history.end().checked_sub(1));
-        self.clipboard = place.and_then(|place| trace::candump_line(model, place));
+        self.clipboard = place.and_then(|place| candump_line(&model.history.get(place)?));
         let said = if self.clipboard.is_some() { "copied" } else { "this is no frame; nothing was copied" };
         said.clone_into(&mut self.message);
     }
 
-    fn move_graph_cursor(&mut self, by: f64) {
-        self.graph_cursor = Some((self.graph_cursor.unwrap_or(1.0) + by).clamp(0.0, 1.0));
-    }
-
     /// The mouse was used.
     pub fn mouse(&mut self, event: MouseEvent, model: &mut Model) {
+        let is_busy = self.prompt.is_some() || self.help;
+        let is_on_page = event.row >= BODY_ROW;
+        if self.view == View::Graph && is_on_page && !is_busy {
+            return self.graph.mouse(event);
+        }
         let code = match event.kind {
             MouseEventKind::ScrollUp => KeyCode::Up,
             MouseEventKind::ScrollDown => KeyCode::Down,
             MouseEventKind::Down(MouseButton::Left) => {
-                if self.prompt.is_none() && !self.help {
+                if !is_busy {
                     self.click(event, model);
                 }
                 return;
             }
             _ => return,
         };
-        if self.prompt.is_none() && !self.help {
-            // On the graph, a step of the wheel is a step of the zoom.
-            for _ in 0..if self.view == View::Graph { 1 } else { WHEEL_ROWS } {
+        if !is_busy {
+            for _ in 0..WHEEL_ROWS {
                 self.page_key(code, model);
             }
         }
@@ -174,20 +237,27 @@ impl App {
 
     fn click(&mut self, event: MouseEvent, model: &Model) {
         if event.row == 0 {
-            if let Some(view) = views::tab_at(event.column) {
+            if let Some(view) = View::at_column(event.column) {
                 self.show(view);
             }
             return;
         }
+        if let Some(bar) = self.bar.filter(|bar| bar.contains((event.column, event.row).into())) {
+            let share = f64::from(event.column - bar.x) / f64::from(bar.width.max(2) - 1);
+            return self.seek_share(share, model);
+        }
+        if event.row == BODY_ROW {
+            return self.click_heading(event.column);
+        }
         // The page begins with a heading; the send list's stands below a sentence.
-        let first_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
-        let Some(row) = event.row.checked_sub(first_row).map(usize::from).filter(|row| *row < self.page_rows)
+        let body_row = BODY_ROW + if self.view == View::Send { 2 } else { 1 };
+        let Some(row) = event.row.checked_sub(body_row).map(usize::from).filter(|row| *row < self.page_rows)
         else {
             return;
         };
         match self.view {
             View::Fixed | View::Signals | View::Send => {
-                self.selected = views::first_row(self.selected, self.page_rows) + row;
+                self.selected = first_row(self.selected, self.page_rows) + row;
             }
             View::Trace => {
                 let top = self.bottom.saturating_sub(self.page_rows as u64).max(model.history.first());

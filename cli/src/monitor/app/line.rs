@@ -27,6 +27,14 @@ impl Line {
         (before.iter().collect(), behind.iter().collect())
     }
 
+    /// What stands before the place becomes this.
+    pub fn replace_before(&mut self, text: &str) {
+        let behind = self.text.split_off(self.place);
+        self.text = text.chars().collect();
+        self.place = self.text.len();
+        self.text.extend(behind);
+    }
+
     /// Empties it.
     pub fn clear(&mut self) {
         *self = Self::default();
@@ -72,6 +80,12 @@ pub enum PromptKind {
     Device,
     /// Whether to take part in the bus.
     Normal,
+    /// Which signals to show.
+    Signals,
+    /// A place in a file.
+    Time,
+    /// A trace or a database.
+    Open,
 }
 
 /// A line of input.

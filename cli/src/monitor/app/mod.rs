@@ -1,25 +1,44 @@
 //! What the user has chosen: page, place, sorting, lines of input. What keys do is in the files beside this one.
 
 mod column;
+mod completion;
 mod device;
 mod entry;
+mod graph;
 mod keys;
 mod line;
+mod open;
+mod player;
 mod prompt;
 mod scroll;
 mod search;
 mod sending;
+mod signals;
 mod state;
+mod wish;
+
+use std::sync::Arc;
 
 use super::model::Model;
 use crate::boards::place_of;
+use crate::databases::Said;
 
 pub use column::Column;
 pub use entry::{SendEntry, parse_entry};
+pub use graph::Drawn;
 pub use line::{Prompt, PromptKind};
+pub use scroll::first_row;
+pub use signals::SignalColumn;
 pub use state::{App, Flow, TimeMode, View};
+pub use wish::Wish;
 
 impl App {
+    /// Decodes with the databases that there are now; what was frozen goes on.
+    pub(super) fn use_databases(&mut self, model: &mut Model) {
+        model.set_decoder(Arc::new(self.databases.decoder()));
+        self.frozen = None;
+    }
+
     /// Takes over what the source found out, and goes on with a search. To be called before each drawing.
     pub fn catch_up(&mut self, model: &mut Model) {
         self.search_on(model);
@@ -37,6 +56,12 @@ impl App {
                 let before = if said.is_empty() { "a new session" } else { &said };
                 model.notice = format!("{before}; nothing is sent periodically any more");
             }
+        }
+        if std::mem::take(&mut model.met_car) && self.databases.is_empty() {
+            let mut said = Said::default();
+            self.databases.add_car(&mut said);
+            self.use_databases(model);
+            model.notice = said.remarks.join("; ");
         }
         for (channel, slot) in model.refused.drain(..) {
             for entry in &mut self.send {

@@ -6,16 +6,24 @@ use cantap_trace::filter::Filter;
 use ratatui::crossterm::event::KeyCode;
 
 use super::super::model::Model;
+use super::super::order::Order;
 use super::super::recorder;
-use super::super::source::Order;
+use super::completion::{Completed, complete};
 use super::entry::parse_entry;
 use super::line::{Prompt, PromptKind};
+use super::signals::SignalFilter;
 use super::state::{App, Direction};
 
 impl App {
     pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {
         match (code, &mut self.prompt) {
             (KeyCode::Esc, _) => self.prompt = None,
+            (KeyCode::Tab, Some(Prompt { kind: PromptKind::Send, line, .. })) => {
+                let (before, _) = line.halves();
+                let Completed { text, choices } = complete(&before, model.seen.signals.decoder());
+                line.replace_before(&text);
+                self.message = choices.join("  ");
+            }
             (KeyCode::Enter, prompt) => {
                 if let Some(prompt) = prompt.take() {
                     self.answer(prompt, model);
@@ -38,8 +46,16 @@ impl App {
                 }
                 Ok(())
             }
+            PromptKind::Record | PromptKind::Send | PromptKind::Time | PromptKind::Open
+                if text.is_empty() =>
+            {
+                Ok(())
+            }
+            PromptKind::Signals => SignalFilter::new(text).map(|filter| self.signals.filter = filter),
+            PromptKind::Time => self.seek_to(text, model),
+            PromptKind::Open => self.open_file(text, model),
+            PromptKind::Device if Self::is_trace(text) => self.open_beside(Path::new(text)),
             PromptKind::Filter => self.set_filters(text, model),
-            PromptKind::Record | PromptKind::Send if text.is_empty() => Ok(()),
             PromptKind::Record => self.record(Path::new(text)),
             PromptKind::Send => parse_entry(text, model).map(|entry| self.put_entry(prompt.entry, entry)),
             PromptKind::BitRate => self.set_bit_rates(text, model),

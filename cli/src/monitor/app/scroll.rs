@@ -5,6 +5,11 @@ use ratatui::crossterm::event::KeyCode;
 use super::super::model::Model;
 use super::state::App;
 
+/// The first row to show so that the selected one is on the page.
+pub fn first_row(selected: usize, rows: usize) -> usize {
+    selected.saturating_sub(rows.saturating_sub(1))
+}
+
 impl App {
     /// In a list: what is past its end is drawn as its end.
     pub(super) fn scroll(&mut self, code: KeyCode) {

@@ -2,19 +2,34 @@
 
 use std::fmt::{Display, Write};
 
-use super::super::event_text::event_text;
+use cantap::Id;
+
+use super::super::event_text::{event_text, hex};
 use super::super::model::Model;
 use super::line::PromptKind;
-use super::state::{App, Direction, Search};
+use super::state::{App, Direction, Search, View};
 
 /// Records that are looked at between two drawings, in some twenty milliseconds.
 const AT_ONCE: u64 = 100_000;
 
 impl App {
-    /// Looks for the next record that has what was last looked for.
+    /// Whether there is something to search on this page; says so if not.
+    pub(super) fn can_search(&mut self) -> bool {
+        let can = matches!(self.view, View::Trace | View::Fixed | View::Signals | View::Send);
+        if !can {
+            "this page has nothing to search; Trace, Fixed, Signals and Send have"
+                .clone_into(&mut self.message);
+        }
+        can
+    }
+
+    /// Looks for the next record or row that has what was last looked for. In the trace that is back in time, in a list downwards.
     pub(super) fn find(&mut self, model: &Model, direction: Direction) {
         if self.wanted.is_empty() {
             return self.ask(PromptKind::Search, "");
+        }
+        if self.view != View::Trace {
+            return self.find_row(model, direction);
         }
         let from = self.cursor.unwrap_or(model.history.end());
         let at = match direction {
@@ -23,6 +38,43 @@ impl App {
         };
         self.search = Some(Search { direction, at });
         self.search_on(model);
+    }
+
+    /// In a list, from the row after the selected one on, round its end.
+    fn find_row(&mut self, model: &Model, direction: Direction) {
+        let seen = self.frozen.as_deref().unwrap_or(&model.seen);
+        let signals = &seen.signals;
+        let rows: Vec<String> = match self.view {
+            View::Fixed => {
+                let text = |(channel, id): &(u8, Id)| {
+                    let message = signals.decoder().find(*channel, *id);
+                    let name = message.map_or("", |message| &signals.decoder().message(message).name);
+                    let row = seen.table.row(*channel, *id);
+                    let data = row.map_or(String::new(), |row| hex(row.frame.data()));
+                    format!("{id} {name} {data} {}", compact(&data))
+                };
+                self.fixed_order.iter().map(text).collect()
+            }
+            View::Signals => {
+                let text = |place: &Option<usize>| {
+                    let row = place.and_then(|place| signals.rows().get(place));
+                    row.map_or(String::new(), |row| {
+                        format!("{} {}", signals.full_name(row), signals.text(row))
+                    })
+                };
+                self.signal_order.iter().map(text).collect()
+            }
+            _ => self.send.iter().map(|entry| format!("{} {}", entry.text, entry.frame)).collect(),
+        };
+        let count = rows.len();
+        let steps = (1..=count).map(|step| match direction {
+            Direction::Back => (self.selected + step) % count,
+            Direction::Forward => (self.selected + count - step % count) % count,
+        });
+        match steps.into_iter().find(|place| rows[*place].to_uppercase().contains(&self.wanted)) {
+            Some(place) => self.selected = place,
+            None => self.message = format!("'{}' is not there", self.wanted),
+        }
     }
 
     /// Goes on with a search for a while.

@@ -1,6 +1,6 @@
 //! The send list: frames that go onto the bus by key, or periodically by the device itself.
 
-use super::super::source::Order;
+use super::super::order::Order;
 use super::entry::SendEntry;
 use super::line::{Line, Prompt, PromptKind};
 use super::state::App;

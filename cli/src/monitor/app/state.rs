@@ -1,15 +1,23 @@
 //! The choices themselves.
 
+use std::collections::HashSet;
+use std::ops::Range;
 use std::sync::mpsc::Sender;
 
 use cantap::Id;
+use ratatui::layout::Rect;
 
 use super::super::model::{Model, Seen};
-use super::super::source::{Order, Plan};
+use super::super::order::Order;
+use super::super::plan::Plan;
 use super::super::theme::Theme;
 use super::column::Column;
 use super::entry::SendEntry;
+use super::graph::Graph;
 use super::line::{Line, Prompt, PromptKind};
+use super::signals::SignalsPage;
+use super::wish::Wish;
+use crate::databases::Databases;
 
 /// A page of the display.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, serde::Deserialize)]
@@ -48,12 +56,21 @@ impl View {
             Self::Record => "Record",
         }
     }
+
+    /// The page whose tab is in this column of the screen's first line.
+    pub fn at_column(column: u16) -> Option<Self> {
+        let mut end = 1;
+        Self::ALL.into_iter().find(|view| {
+            end += view.title().len() as u16 + 3;
+            column < end
+        })
+    }
 }
 
 /// How times are shown.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum TimeMode {
-    /// Seconds since the epoch, as candump -ta.
+    /// The time of day, UTC.
     Absolute,
     /// Seconds since the first record.
     Relative,
@@ -97,28 +114,48 @@ pub struct App {
     pub grouped: bool,
     /// Show how often each bit changed.
     pub heat: bool,
+    /// Where the fixed view's headings that sort stand, as last drawn.
+    pub sort_columns: Vec<(Range<u16>, Column)>,
+    /// Identifiers whose signals stand below their row.
+    pub opened: HashSet<(u8, Id)>,
+    /// The signals of the trace's selected record are shown.
+    pub record_opened: bool,
+    /// How the signals page is.
+    pub signals: SignalsPage,
     /// Selected row of the fixed, signals and send views.
     pub selected: usize,
     /// What the fixed view's rows are, by identifier, as last drawn.
     pub fixed_order: Vec<(u8, Id)>,
-    /// What the signals view's rows are, by place in the table, as last drawn.
-    pub signal_order: Vec<usize>,
+    /// What the signals view's rows are, by place in the table, as last drawn; none is a message's name.
+    pub signal_order: Vec<Option<usize>>,
     /// Rows of the page that fit, as last drawn.
     pub page_rows: usize,
-    /// Seconds that the graph shows.
-    pub graph_span: f64,
-    /// The graph's cursor, as a share of its width.
-    pub graph_cursor: Option<f64>,
+    /// What the graph shows of the time.
+    pub graph: Graph,
     /// Frames to send.
     pub send: Vec<SendEntry>,
     /// The help is shown.
     pub help: bool,
+    /// Its first line in sight; what is past the last is drawn as that.
+    pub help_first: usize,
     /// A line of input.
     pub prompt: Option<Prompt>,
     /// Something to tell once, such as what is wrong with what was typed.
     pub message: String,
+    /// Times to come back to, in their order.
+    pub bookmarks: Vec<i64>,
+    /// Where the file's bar is, as last drawn.
+    pub bar: Option<Rect>,
+    /// What the source is called where it is a file.
+    pub file: Option<String>,
+    /// What is asked of whoever has the display.
+    pub wish: Option<Wish>,
+    /// Which of how many sources this is, from 1.
+    pub beside: (usize, usize),
     /// Text for the clipboard, to be taken by whoever owns the terminal.
     pub clipboard: Option<String>,
+    /// The signal databases.
+    pub databases: Databases,
     /// The device and its buses, if the source is one.
     pub plan: Option<Plan>,
     /// The sessions of the devices that the send list's periodic entries belong to.
@@ -171,17 +208,27 @@ impl App {
             reverse: false,
             grouped: false,
             heat: false,
+            sort_columns: Vec::new(),
+            opened: HashSet::new(),
+            record_opened: false,
+            signals: SignalsPage::default(),
             selected: 0,
             fixed_order: Vec::new(),
             signal_order: Vec::new(),
             page_rows: 20,
-            graph_span: 10.0,
-            graph_cursor: None,
+            graph: Graph::default(),
             send: Vec::new(),
             help: false,
+            help_first: 0,
             prompt: None,
             message: String::new(),
+            bookmarks: Vec::new(),
+            bar: None,
+            file: None,
+            wish: None,
+            beside: (1, 1),
             clipboard: None,
+            databases: Databases::default(),
             plan,
             sessions: Vec::new(),
             orders,

@@ -165,6 +165,11 @@ impl FixedTable {
         &self.rows
     }
 
+    /// One row.
+    pub fn row(&self, channel: u8, id: Id) -> Option<&Row> {
+        self.places.get(&(channel, id)).map(|place| &self.rows[*place])
+    }
+
     /// One row, to mark or hide it.
     pub fn row_mut(&mut self, channel: u8, id: Id) -> Option<&mut Row> {
         self.places.get(&(channel, id)).map(|place| &mut self.rows[*place])

@@ -137,6 +137,25 @@ impl History {
             .and_then(|kept| self.whole(kept))
     }
 
+    /// Place of the first listed record that is no older than a time, else of the last one.
+    pub fn place_at(&self, time_ns: i64) -> Option<u64> {
+        let (mut low, mut high) = (self.first(), self.end());
+        while low < high {
+            let middle = low + (high - low) / 2;
+            match self.get(middle) {
+                Some(record) if record.time_ns < time_ns => low = middle + 1,
+                _ => high = middle,
+            }
+        }
+        let last = self.end().checked_sub(1).filter(|last| *last >= self.first());
+        last.map(|last| low.min(last))
+    }
+
+    /// All records there are, listed or not, the oldest first.
+    pub fn all(&self) -> impl Iterator<Item = TraceRecord> + use<'_> {
+        self.records.iter().filter_map(|kept| self.whole(kept))
+    }
+
     /// Records there are, listed or not.
     pub fn len(&self) -> usize {
         self.records.len()
@@ -194,6 +213,17 @@ mod tests {
         let frame = if n % 3 == 0 { "123#" } else { "124#" }.parse().unwrap();
         let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
         TraceRecord { time_ns: n, channel: 1, event }
+    }
+
+    #[test]
+    fn a_record_is_found_by_its_time() {
+        let mut history = History::new(0);
+        assert_eq!(history.place_at(5), None);
+        (0..2000).for_each(|n| history.push(frame(2 * n)));
+        assert_eq!([0, 2100, 2101, 9999].map(|at| history.place_at(at)), [1000, 1050, 1051, 1999].map(Some));
+        history.set_filters(vec!["123:7FF".parse().unwrap()], None);
+        let at = history.place_at(3001).unwrap();
+        assert!(history.get(at).unwrap().time_ns >= 3001 && history.get(at - 1).unwrap().time_ns < 3001);
     }
 
     #[test]

@@ -4,6 +4,7 @@
 pub mod fixed;
 pub mod history;
 mod kept;
+pub mod series;
 pub mod signals;
 
 use std::collections::VecDeque;
@@ -16,12 +17,13 @@ use cantap::wire::message::Status;
 use cantap_analysis::stats::{Options, Statistics, Window};
 use cantap_signals::Decoder;
 
-use super::source::Plan;
+use super::plan::Plan;
 use crate::hearing::Hearing;
 
 pub use fixed::{FixedTable, Row};
 pub use history::History;
-pub use signals::{Sample, SignalRow, SignalTable};
+pub use series::{Column, Point, Series};
+pub use signals::{Decoded, SignalRow, SignalTable};
 
 /// Windows of the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
@@ -41,16 +43,28 @@ pub enum SourceState {
     /// The bit rates of a device's channels are looked for.
     Searching,
     /// A file, in playback.
-    Playing {
-        /// Delay factor.
-        factor: f64,
-        /// Whether it is paused.
-        paused: bool,
-        /// Whether it begins anew after its end.
-        looped: bool,
-        /// Whether it is over.
-        ended: bool,
-    },
+    Playing(Playing),
+}
+
+/// How a playback goes. Times are in nanoseconds as in [`TraceRecord::time_ns`].
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Playing {
+    /// Delay factor: 1 is real time, 2 takes twice as long, 0 is as fast as can be.
+    pub factor: f64,
+    /// Whether it is paused.
+    pub paused: bool,
+    /// Whether it begins anew after its end.
+    pub looped: bool,
+    /// Whether it is over.
+    pub ended: bool,
+    /// Whether it is on its way to another place.
+    pub seeking: bool,
+    /// Time of the file's first record.
+    pub first_ns: i64,
+    /// Where it is.
+    pub position_ns: i64,
+    /// The latest time in the file, once that is known.
+    pub end_ns: Option<i64>,
 }
 
 /// A recording that runs.
@@ -128,6 +142,8 @@ pub struct Model {
     pub found: Option<Plan>,
     /// Periodic transmissions that the device refused, by channel and slot, until the display has taken note.
     pub refused: Vec<(u8, u8)>,
+    /// A virtual vehicle is at one of the ports, until the display has taken note.
+    pub met_car: bool,
     /// What the device's channels hear.
     pub hearing: Hearing,
     /// Places in the file played back that could not be read, and what was wrong with the first of them.
@@ -145,7 +161,7 @@ impl Model {
         let options = Options { window: LOAD_WINDOW, ..options };
         let seen = Seen {
             table: FixedTable::default(),
-            signals: SignalTable::new(decoder),
+            signals: SignalTable::new(decoder, history_bytes),
             statistics: Statistics::new(options.clone())?,
             loads: Vec::new(),
             devices: Vec::new(),
@@ -160,6 +176,7 @@ impl Model {
             sessions: Vec::new(),
             found: None,
             refused: Vec::new(),
+            met_car: false,
             hearing: Hearing::default(),
             unread: None,
             recording: None,
@@ -171,6 +188,13 @@ impl Model {
     /// The options that the statistics were made with.
     pub fn options(&self) -> &Options {
         &self.options
+    }
+
+    /// Decodes otherwise from now on, the past too.
+    pub fn set_decoder(&mut self, decoder: Arc<Decoder>) {
+        let Seen { signals, .. } = &mut self.seen;
+        signals.set_decoder(decoder);
+        self.history.all().for_each(|record| signals.take(&record));
     }
 
     /// Takes records in their order.

@@ -4,29 +4,18 @@ use std::collections::{HashMap, VecDeque};
 use std::sync::Arc;
 
 use cantap::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_signals::{Alarm, Decoder, MessageRef, Signal, SignalValue};
+use cantap_signals::{Alarm, Decoder, MessageRef, Selection, SelectionError, Signal, SignalValue};
+
+use super::series::{BLOCK_BYTES, Series};
 
 /// Signals with a row; more than any screen shows.
 const MOST_SIGNALS: usize = 1024;
-/// Samples kept of each signal.
-const MOST_SAMPLES: usize = 2048;
-/// Values within this time become one sample with their extremes.
-const SAMPLE_NS: i64 = 20_000_000;
-
-/// Values of a short time.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct Sample {
-    /// When the last of them came.
-    pub time_ns: i64,
-    /// The smallest.
-    pub min: f64,
-    /// The largest.
-    pub max: f64,
-    /// The last.
-    pub last: f64,
-    /// Nothing is known of the time between the sample before and this one.
-    pub after_gap: bool,
-}
+/// Of values within this time the recent past keeps the last.
+const RECENT_STEP_NS: i64 = 100_000_000;
+/// How many of them it keeps: eight seconds and a little.
+const MOST_RECENT: usize = 90;
+/// Memory that the graph's values may take however little there is, in bytes.
+const LEAST_ROOM: usize = 16 * BLOCK_BYTES;
 
 /// One signal on one channel.
 #[derive(Clone, Debug)]
@@ -45,16 +34,16 @@ pub struct SignalRow {
     pub value: f64,
     /// When it came.
     pub time_ns: i64,
+    /// When it last became another one.
+    pub changed_ns: i64,
     /// The smallest value so far.
     pub min: f64,
     /// The largest value so far.
     pub max: f64,
-    /// The recent past, the newest last.
-    pub samples: VecDeque<Sample>,
-    /// In the graph.
-    pub chosen: bool,
-    /// Nothing is known of the time since the last sample.
-    gap: bool,
+    /// Values of the last seconds with their times, the newest last, a few a second.
+    pub recent: VecDeque<(i64, f64)>,
+    /// All its values, while it is in the graph.
+    pub series: Option<Series>,
 }
 
 impl SignalRow {
@@ -65,6 +54,16 @@ impl SignalRow {
     }
 }
 
+/// A signal in a frame, in words.
+pub struct Decoded {
+    /// What the signal is called.
+    pub name: String,
+    /// Its value with text and unit.
+    pub text: String,
+    /// The alarm that it raises.
+    pub alarm: Option<Alarm>,
+}
+
 /// All signals seen, in order of appearance.
 #[derive(Clone)]
 pub struct SignalTable {
@@ -72,19 +71,45 @@ pub struct SignalTable {
     rows: Vec<SignalRow>,
     places: HashMap<(u8, MessageRef, u32), usize>,
     values: Vec<SignalValue>,
-    /// Names of signals that go into the graph when they are first seen.
-    chosen: Vec<String>,
+    /// Patterns of signals that go into the graph when they are first seen.
+    chosen: Vec<Selection>,
+    /// Which signals were in the graph when everything was forgotten, and which were not.
+    decided: HashMap<(u8, MessageRef, u32), bool>,
+    /// Memory that the values of the signals in the graph may take, in bytes.
+    room: usize,
 }
 
 impl SignalTable {
-    /// Nothing seen yet.
-    pub fn new(decoder: Arc<Decoder>) -> Self {
-        Self { decoder, rows: Vec::new(), places: HashMap::new(), values: Vec::new(), chosen: Vec::new() }
+    /// Nothing seen yet. The values of signals in the graph take so many bytes at most.
+    pub fn new(decoder: Arc<Decoder>, room: usize) -> Self {
+        Self {
+            decoder,
+            rows: Vec::new(),
+            places: HashMap::new(),
+            values: Vec::new(),
+            chosen: Vec::new(),
+            decided: HashMap::new(),
+            room: room.max(LEAST_ROOM),
+        }
+    }
+
+    /// Decodes by other databases from now on. Nothing is seen yet; of what was in the graph, signals of the same name will be.
+    pub fn set_decoder(&mut self, decoder: Arc<Decoder>) {
+        let graphed = self.rows.iter().filter(|row| row.series.is_some());
+        let names = graphed.map(|row| format!("{}.{}", self.message_name(row), self.signal(row).name));
+        let names: Vec<_> = names.map(|name| glob_escaped(&name)).collect();
+        self.decoder = decoder;
+        self.clear();
+        self.decided.clear();
+        self.chosen.extend(names.iter().filter_map(|name| Selection::new(&[name]).ok()));
     }
 
     /// Takes a record.
     pub fn take(&mut self, record: &TraceRecord) {
         let Some(frame) = record.frame() else {
+            if matches!(record.event, TraceEvent::Lost { .. }) {
+                self.interrupt_channel(record.channel);
+            }
             return;
         };
         let mut values = std::mem::take(&mut self.values);
@@ -101,6 +126,10 @@ impl SignalTable {
         let place = match self.places.get(&key) {
             Some(place) => *place,
             None if self.rows.len() < MOST_SIGNALS => {
+                let described = self.decoder.message(message);
+                let signal = &described.signals[value.signal as usize];
+                let by_pattern = || self.chosen.iter().any(|chosen| chosen.matches(described, signal));
+                let is_chosen = self.decided.get(&key).copied().unwrap_or_else(by_pattern);
                 self.rows.push(SignalRow {
                     channel: record.channel,
                     message,
@@ -109,13 +138,11 @@ impl SignalTable {
                     raw: value.raw,
                     value: value.value,
                     time_ns: record.time_ns,
+                    changed_ns: record.time_ns,
                     min: value.value,
                     max: value.value,
-                    samples: VecDeque::new(),
-                    gap: false,
-                    chosen: self.chosen.iter().any(|name| {
-                        *name == self.decoder.message(message).signals[value.signal as usize].name
-                    }),
+                    recent: VecDeque::new(),
+                    series: is_chosen.then(Series::default),
                 });
                 self.places.insert(key, self.rows.len() - 1);
                 self.rows.len() - 1
@@ -123,42 +150,61 @@ impl SignalTable {
             None => return,
         };
         let row = &mut self.rows[place];
+        if row.raw != value.raw {
+            row.changed_ns = record.time_ns;
+        }
         row.frame = frame;
         row.raw = value.raw;
         row.value = value.value;
         row.time_ns = record.time_ns;
         row.min = row.min.min(value.value);
         row.max = row.max.max(value.value);
-        let (time_ns, last) = (record.time_ns, value.value);
-        if last.is_nan() {
-            // No value is none to draw, and what comes next does not continue what was before.
-            row.gap = true;
-            return;
-        }
-        // Time that runs backwards, as where a file begins anew, leaves nothing to compare with.
-        if row.samples.back().is_some_and(|sample| time_ns < sample.time_ns) {
-            row.samples.clear();
-        }
-        // A sample begins in its own slot of time, so that a fast signal does not stretch one for ever.
-        let slot = time_ns.div_euclid(SAMPLE_NS);
-        match row.samples.back_mut() {
-            Some(sample) if sample.time_ns.div_euclid(SAMPLE_NS) == slot => {
-                let (min, max) = (sample.min.min(last), sample.max.max(last));
-                *sample = Sample { time_ns, min, max, last, ..*sample };
-            }
-            _ => {
-                if row.samples.len() == MOST_SAMPLES {
-                    row.samples.pop_front();
-                }
-                let after_gap = std::mem::take(&mut row.gap);
-                row.samples.push_back(Sample { time_ns, min: last, max: last, last, after_gap });
+        keep_recent(&mut row.recent, record.time_ns, value.value);
+        if let Some(series) = &mut row.series {
+            let blocks = series.blocks();
+            series.push(record.time_ns, value.value);
+            if series.blocks() > blocks {
+                self.make_room();
             }
         }
     }
 
+    /// The oldest values of the signals in the graph make room.
+    fn make_room(&mut self) {
+        while self.graph_bytes() > self.room {
+            let graphed = self.rows.iter_mut().filter_map(|row| row.series.as_mut());
+            // The one that goes back furthest; what comes now must stay.
+            let Some(oldest) =
+                graphed.filter(|series| series.blocks() > 1).min_by_key(|series| series.first_ns())
+            else {
+                return;
+            };
+            oldest.cut();
+        }
+    }
+
+    fn series(&self) -> impl Iterator<Item = &Series> {
+        self.rows.iter().filter_map(|row| row.series.as_ref())
+    }
+
+    fn graph_bytes(&self) -> usize {
+        self.series().map(|series| series.blocks() * BLOCK_BYTES).sum()
+    }
+
+    /// Values kept for the graph, the bytes that they take, and the bytes that there are for them.
+    pub fn graph_memory(&self) -> (usize, usize, usize) {
+        (self.series().map(Series::len).sum(), self.graph_bytes(), self.room)
+    }
+
     /// Nothing is known of the time from here to the next values.
     pub fn interrupt(&mut self) {
-        self.rows.iter_mut().for_each(|row| row.gap = true);
+        self.rows.iter_mut().filter_map(|row| row.series.as_mut()).for_each(Series::interrupt);
+    }
+
+    /// Frames of a channel are missing here: any signal's may be among them.
+    fn interrupt_channel(&mut self, channel: u8) {
+        let of_channel = self.rows.iter_mut().filter(|row| row.channel == channel);
+        of_channel.filter_map(|row| row.series.as_mut()).for_each(Series::interrupt);
     }
 
     /// The rows.
@@ -166,16 +212,39 @@ impl SignalTable {
         &self.rows
     }
 
-    /// A signal of this name goes into the graph when it is first seen.
-    pub fn choose(&mut self, name: &str) {
-        self.chosen.push(name.to_owned());
+    /// Signals that a pattern matches, such as `Speed` or `Engine.*`, go into the graph when they are first seen. Fails if no signal
+    /// of the databases does.
+    pub fn choose(&mut self, pattern: &str) -> Result<(), SelectionError> {
+        let selection = Selection::new(&[pattern])?;
+        selection.check(&self.decoder.messages().map(|(_, _, message)| message))?;
+        self.chosen.push(selection);
+        Ok(())
     }
 
-    /// Puts a signal into the graph or takes it out.
-    pub fn toggle(&mut self, row: usize) {
-        if let Some(row) = self.rows.get_mut(row) {
-            row.chosen = !row.chosen;
+    /// Puts a signal into the graph, with what the past has of it, or takes it out.
+    pub fn toggle(&mut self, row: usize, past: impl Iterator<Item = TraceRecord>) {
+        let Some(row) = self.rows.get_mut(row) else {
+            return;
+        };
+        if row.series.take().is_some() {
+            return;
         }
+        let mut series = Series::default();
+        let mut values = Vec::new();
+        for record in past.filter(|record| record.channel == row.channel) {
+            match (record.event, record.frame()) {
+                (TraceEvent::Lost { .. }, _) => series.interrupt(),
+                (_, Some(frame)) if self.decoder.find(row.channel, frame.id()) == Some(row.message) => {
+                    self.decoder.decode(row.channel, frame, &mut values);
+                    if let Some(value) = values.iter().find(|value| value.signal == row.signal) {
+                        series.push(record.time_ns, value.value);
+                    }
+                }
+                _ => {}
+            }
+        }
+        row.series = Some(series);
+        self.make_room();
     }
 
     /// What the database says about a row's signal.
@@ -188,6 +257,11 @@ impl SignalTable {
         &self.decoder.message(row.message).name
     }
 
+    /// `Message.Signal`, by which signals are looked for.
+    pub fn full_name(&self, row: &SignalRow) -> String {
+        format!("{}.{}", self.message_name(row), self.signal(row).label())
+    }
+
     /// The message that a frame is, by name.
     pub fn name_of(&self, record: &TraceRecord) -> Option<&str> {
         let message = self.decoder.find(record.channel, record.frame()?.id())?;
@@ -196,15 +270,37 @@ impl SignalTable {
 
     /// The value with its text and unit.
     pub fn text(&self, row: &SignalRow) -> String {
-        let signal = self.signal(row);
-        if let Some(indicator) = self.decoder.message(row.message).indicator(signal, row.raw) {
-            return signal.text(row.raw).unwrap_or(indicator.name()).to_owned();
+        self.raw_text(row.message, row.signal, row.raw)
+    }
+
+    fn raw_text(&self, message: MessageRef, signal: u32, raw: u64) -> String {
+        let message = self.decoder.message(message);
+        let signal = &message.signals[signal as usize];
+        if let Some(indicator) = message.indicator(signal, raw) {
+            return signal.text(raw).unwrap_or(indicator.name()).to_owned();
         }
-        let number = signal.number(row.raw).for_people();
-        match signal.text(row.raw) {
+        let number = signal.number(raw).for_people();
+        match signal.text(raw) {
             Some(text) => format!("{number} ({text})"),
             None => format!("{number} {}", signal.unit).trim_end().to_owned(),
         }
+    }
+
+    /// What is in a frame, signal by signal.
+    pub fn in_frame(&self, channel: u8, frame: &TraceFrame) -> Vec<Decoded> {
+        let mut values = Vec::new();
+        let Some(message) = self.decoder.decode(channel, frame, &mut values) else {
+            return Vec::new();
+        };
+        let decoded = values.iter().map(|value| {
+            let signal = &self.decoder.message(message).signals[value.signal as usize];
+            Decoded {
+                name: signal.label().into_owned(),
+                text: self.raw_text(message, value.signal, value.raw),
+                alarm: signal.alarms.check(value.value),
+            }
+        });
+        decoded.collect()
     }
 
     /// As [`Self::text`] in so many columns: digits go before the unit does.
@@ -240,9 +336,41 @@ impl SignalTable {
         &self.decoder
     }
 
-    /// Forgets all values.
+    /// Forgets all values; what is in the graph is there again when it is seen again.
     pub fn clear(&mut self) {
-        self.rows.clear();
+        for row in self.rows.drain(..) {
+            self.decided.insert((row.channel, row.message, row.signal), row.series.is_some());
+        }
         self.places.clear();
+    }
+}
+
+/// A name as the pattern that matches nothing else.
+fn glob_escaped(name: &str) -> String {
+    let escape = |character: char| match character {
+        '*' | '?' | '[' => format!("[{character}]"),
+        other => other.to_string(),
+    };
+    name.chars().map(escape).collect()
+}
+
+/// Keeps the last value of each step of time.
+fn keep_recent(recent: &mut VecDeque<(i64, f64)>, time_ns: i64, value: f64) {
+    if value.is_nan() {
+        return;
+    }
+    // Time that runs backwards, as where a file begins anew, leaves nothing to compare with.
+    if recent.back().is_some_and(|(last_ns, _)| time_ns < *last_ns) {
+        recent.clear();
+    }
+    let step = |time_ns: i64| time_ns.div_euclid(RECENT_STEP_NS);
+    match recent.back_mut() {
+        Some(last) if step(last.0) == step(time_ns) => *last = (time_ns, value),
+        _ => {
+            if recent.len() == MOST_RECENT {
+                recent.pop_front();
+            }
+            recent.push_back((time_ns, value));
+        }
     }
 }

@@ -8,7 +8,8 @@ use cantap::device::channel_number;
 use cantap::wire::message::Mode;
 
 use super::super::model::SourceState;
-use super::{Plan, Source, Then, lock};
+use super::super::plan::Plan;
+use super::{Source, Then, lock};
 use crate::advice;
 use crate::channel_bitrate::ChannelBitrate;
 
@@ -41,7 +42,14 @@ impl Source<'_> {
                         format!("channel {number}: {bitrate_bps} bit/s")
                     }
                     Ok(Outcome::NoTraffic) => format!("channel {number}: no traffic"),
-                    Ok(Outcome::NoMatch { .. }) => format!("channel {number}: traffic, but no bit rate fits"),
+                    Ok(Outcome::Stuck) => format!("channel {number}: the bus is dominant all the time"),
+                    Ok(Outcome::Unreadable { .. }) => format!("channel {number}: traffic, but not one whole frame"),
+                    Ok(Outcome::Unreachable { measured_bps, .. }) => {
+                        format!("channel {number}: {measured_bps:.0} bit/s, which the device's clock does not reach")
+                    }
+                    Ok(Outcome::Unconfirmed { bitrate_bps, .. }) => {
+                        format!("channel {number}: bits of {bitrate_bps} bit/s, but no good frame")
+                    }
                     Ok(Outcome::Stopped) => format!("channel {number}: stopped"),
                     Err(error) => format!("channel {number}: {}", advice::told(&error)),
                 });
@@ -116,10 +124,10 @@ impl Source<'_> {
 
 fn describe(progress: Progress) -> String {
     match progress {
-        Progress::Common { bitrate_bps, at, of } => {
-            format!("common rates {}/{of}, {bitrate_bps} bit/s", at + 1)
+        Progress::Measuring { edges: 0 } => "waiting for traffic to measure".to_owned(),
+        Progress::Measuring { edges } => format!("measuring bits, {edges} edges"),
+        Progress::Confirming { bitrate_bps, frames } => {
+            format!("{bitrate_bps} bit/s measured, {frames} good frames at it")
         }
-        Progress::Scan { bitrate_bps, at, of } => format!("all rates {}/{of}, {bitrate_bps} bit/s", at + 1),
-        Progress::Checking { bitrate_bps } => format!("frames at {bitrate_bps} bit/s, making sure"),
     }
 }

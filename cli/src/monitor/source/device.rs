@@ -6,10 +6,13 @@ use std::time::{Duration, Instant};
 
 use cantap::device::{Happening, Return, UtcClock, channel_number};
 use cantap::wire::message::{ChannelConfig, Periodic, TxFrame};
-use cantap::{Frame, TraceEvent, TraceRecord};
+use cantap::wire::record::ErrorState;
+use cantap::{Channel, Frame, TraceEvent, TraceRecord};
 
 use super::super::model::{DeviceFigures, SourceState};
-use super::{FIGURES_EVERY, Order, Plan, Source, Then, WAIT, lock};
+use super::super::order::Order;
+use super::super::plan::Plan;
+use super::{FIGURES_EVERY, Source, Then, WAIT, lock};
 use crate::advice;
 use crate::boards::place_of;
 use crate::hearing::Hearing;
@@ -72,6 +75,7 @@ impl Source<'_> {
         // Devices of which nothing is known yet, and what was ordered meanwhile.
         let mut unknown = vec![true; plan.addresses.len()];
         let mut early = VecDeque::new();
+        let mut recoveries: Vec<_> = plan.addresses.iter().map(|_| plan.open.recovery()).collect();
         lock(self.model).source = SourceState::Starting;
         loop {
             match lines.next(WAIT) {
@@ -95,6 +99,14 @@ impl Source<'_> {
                 }
                 // Nobody has stopped it.
                 (_, Happening::Ended) => return Then::GoOn,
+            }
+            for (board, device) in lines.devices() {
+                // If it does not answer, the stream says so.
+                let back = recoveries[board].as_mut().and_then(|recovery| recovery.look(device).ok());
+                for channel in back.into_iter().flatten() {
+                    let number = channel_number(board, channel);
+                    self.notice(format!("channel {number} was bus-off and joins the bus again"));
+                }
             }
             if Instant::now() >= next_figures {
                 next_figures = Instant::now() + FIGURES_EVERY;
@@ -195,6 +207,7 @@ impl Source<'_> {
         };
         model.source = SourceState::Running;
         model.sessions[board] += 1;
+        model.met_car |= hello.board == cantap_virtual::car::BOARD;
         let rates =
             opened.iter().map(|(number, config, clock_hz)| (*number, config.timing.bitrate_bps(*clock_hz)));
         let rates: Vec<_> = rates.collect();
@@ -223,6 +236,10 @@ impl Source<'_> {
 
     /// An order, where there is a device to send with.
     fn follow_with(&mut self, lines: &Lines, order: Order) -> Then {
+        if matches!(order, Order::Recover) && lines.devices().next().is_some() {
+            self.recover(lines);
+            return Then::GoOn;
+        }
         let (Order::Send(number, _) | Order::SetPeriodic(number, ..)) = order else {
             return self.follow(order);
         };
@@ -247,6 +264,34 @@ impl Source<'_> {
             }
             order => self.follow(order),
         }
+    }
+
+    /// Brings the channels that are bus-off back onto their buses.
+    fn recover(&self, lines: &Lines) {
+        let mut said = Vec::new();
+        for (board, device) in lines.devices() {
+            let status = match device.status() {
+                Ok(status) => status,
+                Err(error) => {
+                    said.push(advice::told(&error));
+                    continue;
+                }
+            };
+            for (channel, state) in Channel::ALL.into_iter().zip(&status.channels) {
+                if state.open.is_none() || state.state != ErrorState::BusOff {
+                    continue;
+                }
+                let number = channel_number(board, channel);
+                said.push(match device.recover(channel) {
+                    Ok(()) => format!("channel {number} comes back onto its bus"),
+                    Err(error) => format!("channel {number}: {}", advice::told(&error)),
+                });
+            }
+        }
+        if said.is_empty() {
+            said.push("no channel is bus-off".to_owned());
+        }
+        self.notice(said.join("; "));
     }
 
     /// From now on nothing is known about the buses: the trace and the recording say so in place, and no figure

@@ -4,14 +4,14 @@ use std::sync::Arc;
 
 use cantap::{TraceEvent, TraceRecord};
 use cantap_analysis::stats::Options;
-use cantap_signals::{Decoder, Source};
+use cantap_signals::Decoder;
 use ratatui::buffer::Buffer;
 use ratatui::style::{Color, Modifier};
 
 use super::super::app::{App, View};
 use super::super::model::Model;
 use super::super::screen;
-use super::{app, frame, model, press};
+use super::{app, database, frame, model, press};
 
 fn buffer(app: &mut App, model: &Model) -> Buffer {
     screen(app, model, (160, 50)).unwrap()
@@ -83,12 +83,7 @@ fn alarms_are_red_above_and_blue_below_each_with_its_arrow() {
         at = "D1"
         alarm = { min = 10, max = 200 }
     "#;
-    let folder = tempfile::tempdir().unwrap();
-    let path = folder.path().join("m.toml");
-    std::fs::write(&path, text).unwrap();
-    let database = cantap_signals::load(&path).unwrap();
-    assert_eq!(database.warnings, []);
-    let decoder = Arc::new(Decoder::new(vec![Source { channel: None, database }]));
+    let decoder = database(text);
     for (data, arrow, colour) in [("FF", "▲", Color::LightRed), ("01", "▼", Color::LightBlue)] {
         let mut model = Model::new(Arc::clone(&decoder), Options::default(), 0).unwrap();
         let event: TraceEvent = frame(&format!("123#{data}"));

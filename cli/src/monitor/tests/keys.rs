@@ -8,7 +8,7 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::super::app::{Flow, TimeMode, View};
 use super::super::model::Model;
-use super::super::source::Order;
+use super::super::order::Order;
 use super::{app, model, press, screen_text};
 
 #[test]

@@ -4,10 +4,14 @@
 //! `CANTAP_OVERWRITE=1 cargo test -p cantap-cli monitor` and look at the difference.
 
 mod colours;
+mod graph;
+mod help;
 mod keys;
+mod pages;
 mod random;
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::sync::mpsc::Receiver;
 
 use cantap::device::ClockReport;
@@ -22,7 +26,8 @@ use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers};
 
 use super::app::{App, Flow, View};
 use super::model::{DeviceFigures, Model, Recording, SourceState};
-use super::source::{Order, Plan};
+use super::order::Order;
+use super::plan::Plan;
 use super::theme::Theme;
 use super::{orders, screen, text};
 
@@ -42,9 +47,9 @@ fn model() -> Model {
     let decoder = Decoder::new(vec![Source { channel: None, database }]);
     let options = Options { bitrate_bps: Some(250_000), ..Options::default() };
     let mut model = Model::new(decoder.into(), options, 1_000_000).unwrap();
-    model.seen.signals.choose("Speed");
-    model.seen.signals.choose("Course");
-    model.seen.signals.choose("Moving");
+    model.seen.signals.choose("Speed").unwrap();
+    model.seen.signals.choose("Course").unwrap();
+    model.seen.signals.choose("Moving").unwrap();
     let log = Path::new(env!("CARGO_MANIFEST_DIR")).join("../host/formats/tests/data/nmea2000.log.gz");
     let records = open_reader(log, &ReadOptions::default()).unwrap();
     let mut records: Vec<_> = records.take(6000).map(Result::unwrap).collect();
@@ -117,6 +122,16 @@ fn app(view: View) -> (App, Receiver<Order>) {
     let options = Options { channel_bitrate_bps: vec![(1, 250_000)], ..Options::default() };
     let plan = Plan::listening(vec![Address::of_virtual_device()], &options);
     (App::new(view, theme, Some(plan), sender), receiver)
+}
+
+/// A signal file's text as what decodes with it.
+fn database(text: &str) -> Arc<Decoder> {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("m.toml");
+    std::fs::write(&path, text).unwrap();
+    let database = cantap_signals::load(&path).unwrap();
+    assert_eq!(database.warnings, []);
+    Arc::new(Decoder::new(vec![Source { channel: None, database }]))
 }
 
 fn frame(text: &str) -> TraceEvent {

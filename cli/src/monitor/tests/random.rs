@@ -8,8 +8,8 @@ use ratatui::backend::TestBackend;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::app::{App, View};
-use super::super::model::{Model, Recording, SourceState};
-use super::super::source::Order;
+use super::super::model::{Model, Playing, Recording, SourceState};
+use super::super::order::Order;
 use super::super::views;
 use super::{app, device, frame, model};
 
@@ -58,7 +58,7 @@ fn mouse(random: &mut fastrand::Rng) -> MouseEvent {
 
 /// A line that a user might type, right or wrong.
 fn line(random: &mut fastrand::Rng) -> &'static str {
-    const LINES: [&str; 12] = [
+    const LINES: [&str; 18] = [
         "f09F80202:1FFFFFFF\n",
         "f#FFFFFFFF,j\n",
         "fnonsense,\n\x1b",
@@ -71,6 +71,12 @@ fn line(random: &mut fastrand::Rng) -> &'static str {
         "b1:125k 2:83.333k\n",
         "b0\n\x1b",
         "Demu:\n\x1b",
+        "3FSpeed > 0.01\n",
+        "3F> x\n\x1b",
+        "T50%\n\x1b",
+        "T1:30\n\x1b",
+        "Onothing.log\n\x1b",
+        "2/cog\n",
     ];
     LINES[random.usize(..LINES.len())]
 }
@@ -103,7 +109,16 @@ fn happen(random: &mut fastrand::Rng, model: &mut Model, now_ns: &mut i64) {
         1 => model.source = SourceState::Running,
         2 => {
             let (paused, looped, ended) = (random.bool(), random.bool(), random.bool());
-            model.source = SourceState::Playing { factor: 0.5, paused, looped, ended };
+            model.source = SourceState::Playing(Playing {
+                factor: 0.5,
+                paused,
+                looped,
+                ended,
+                seeking: random.bool(),
+                first_ns: random.i64(..),
+                position_ns: random.i64(..),
+                end_ns: random.bool().then(|| random.i64(..)),
+            });
         }
         3 => model.interrupt(),
         4 => model.sessions = vec![u32::from(random.u8(..))],

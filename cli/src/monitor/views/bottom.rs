@@ -91,15 +91,26 @@ fn input(prompt: &Prompt, width: usize) -> Line<'static> {
 
 fn question(kind: PromptKind) -> &'static str {
     match kind {
-        PromptKind::Search => "search the trace: bytes, identifiers, names, words of errors and losses",
-        PromptKind::Filter => "show only, in candump's syntax, such as 123:7FF or can1 (empty: all)",
+        PromptKind::Search => "search this page: bytes, identifiers, names, words of errors and losses",
+        PromptKind::Filter => {
+            "show only, in candump's syntax, such as 123:7FF, or can0,123:7FF for channel 1 (empty: all)"
+        }
+        PromptKind::Signals => {
+            "show only signals with this in their name (* is anything), as Wheel*Speed > 80, or alarm (empty: all)"
+        }
+        PromptKind::Time => {
+            "go to: a time since the beginning, such as 90s, 1:30 or 1:02:03, or a share, such as 50%"
+        }
+        PromptKind::Open => "open: a trace, beside what runs, or a database (.dbc .toml .arxml .kcd .sym)",
         PromptKind::Record => {
             "record to FILE, or FILE if CONDITION (.log .asc .blf .csv .trc .pcapng, each also .gz .zst)"
         }
-        PromptKind::Send => "[CHANNEL:]FRAME or Message:Signal=value,…, then a period if it is periodic",
+        PromptKind::Send => {
+            "[CHANNEL:]FRAME or Message:Signal=value,… (Tab completes), then a period if it is periodic"
+        }
         PromptKind::BitRate => "bit rates: 500k, or one for each channel: 1:500k 2:250k",
         PromptKind::Device => {
-            "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them"
+            "device: a serial port, virtual, or emu:FIRMWARE.elf; several with \" + \" between them; a trace opens beside"
         }
         PromptKind::Normal => "acknowledge other nodes' frames, and send on request, on this bus? y or n",
     }
@@ -125,20 +136,25 @@ fn said(app: &App, model: &Model) -> Option<String> {
 /// As many of the page's keys, which stand two blanks apart, as there is room for.
 fn keys(app: &App, model: &Model, width: usize) -> String {
     let keys = match app.view {
-        View::Trace => "t time  / search  n N next  y copy  ↑↓ scroll  End newest  f filter",
-        View::Fixed => "s S sort  g group  # * notch  H heat  x u hide  o colour  f filter",
-        View::Signals => "↑↓ select  Enter into the graph",
-        View::Graph => "+ - zoom  ← → cursor  Esc no cursor",
-        View::Statistics => "b bit rate  A find it  D device  m mode",
+        View::Trace => "t time  / search  n N next  Enter signals  y copy  ↑↓ scroll  End newest  f filter",
+        View::Fixed => {
+            "Enter signals  s S sort  / search  g group  # * notch  H heat  x u hide  o colour  f filter"
+        }
+        View::Signals => "Enter into the graph  / search  s S sort  g group  F condition",
+        View::Graph => "+ - zoom  ← → pan  x cursors  a all  s steps or lines  End follow",
+        View::Statistics => "b bit rate  A find it  D device  m mode  R recover",
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",
     };
     let playback = match model.source {
-        SourceState::Playing { .. } => "  , . speed  p stop  > step  l loop",
+        SourceState::Playing(_) => {
+            "Space stop  [ ] seek  , . speed  T go to  B { } bookmarks  > step  l loop  "
+        }
         _ => "",
     };
-    let pause = if app.view == View::Send { "" } else { "  Space pause" };
-    let mut all = format!("h help  q quit  {keys}{playback}{pause}  c clear");
+    let is_file = !playback.is_empty();
+    let pause = if app.view == View::Send || is_file { "" } else { "  Space pause" };
+    let mut all = format!("h help  q quit  {playback}{keys}{pause}  c clear");
     if all.chars().count() > width {
         let ends = all.match_indices("  ").map(|(at, _)| at);
         let end = ends.filter(|end| all[..*end].chars().count() <= width).last().unwrap_or(0);

@@ -7,42 +7,100 @@ use ratatui::text::{Line, Span};
 
 use super::super::app::{App, Column};
 use super::super::event_text::printable;
-use super::super::model::{Model, Row, Seen};
+use super::super::model::{Decoded, Model, Row, Seen};
+use super::super::theme::Theme;
 use super::list::list;
+use super::signals::{alarm, in_line};
+
+/// Where the characters, and the rows' signals, have room beside the data.
+const LEAST_WITH_CHARACTERS: u16 = 100;
+/// Where the rows' signals have room beside the data.
+const LEAST_WITH_SIGNALS: u16 = 120;
+/// The columns' headings; what they are sorted by, their width, and whether they begin at its left.
+const COLUMNS: [(&str, Option<Column>, usize, bool); 9] = [
+    ("C", None, 1, true),
+    ("ID", Some(Column::Id), 9, false),
+    ("Count", Some(Column::Count), 9, false),
+    ("Period ms", Some(Column::Period), 10, false),
+    ("Jitter", Some(Column::Jitter), 9, false),
+    ("L", None, 1, true),
+    ("Data", Some(Column::Time), 23, true),
+    ("ASCII", None, 8, true),
+    ("Name", Some(Column::Name), usize::MAX, true),
+];
+
+/// A line of the page.
+enum Entry<'a> {
+    /// An identifier's.
+    Row(&'a Row),
+    /// One of the signals of the row above, which is opened.
+    Signal(Decoded),
+}
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, seen: &Seen) {
     let rows = sorted(app, model, seen);
-    app.fixed_order = rows.iter().map(|row| (row.channel, row.frame.id())).collect();
-    let mark = |column: Column, text: &str| {
-        let arrow = match (app.theme.unicode, app.reverse) {
-            _ if app.sort != column => "",
-            (true, false) => "▾",
-            (true, true) => "▴",
-            (false, false) => "v",
-            (false, true) => "^",
-        };
-        format!("{text}{arrow}")
-    };
     let hidden = seen.table.rows().len() - rows.len();
-    let more = match (hidden, seen.table.unlisted) {
-        (0, 0) => String::new(),
-        (hidden, 0) => format!(" ({hidden} hidden)"),
-        (_, unlisted) => format!(" ({unlisted} frames of further IDs)"),
-    };
-    // Where there is little room, the name is worth more than the characters.
-    let ascii = area.width >= 100;
-    let heading = Line::from(format!(
-        "C {:>9} {:>9} {:>10} {:>9} L {:<23} {}{}{more}",
-        mark(Column::Id, "ID"),
-        mark(Column::Count, "Count"),
-        mark(Column::Period, "Period ms"),
-        mark(Column::Jitter, "Jitter"),
-        "Data",
-        if ascii { "ASCII    " } else { "" },
-        mark(Column::Name, "Name"),
-    ));
-    list(frame, area, app, heading, rows.len(), |index, app| line(rows[index], ascii, app, seen));
+    let ascii = area.width >= LEAST_WITH_CHARACTERS;
+    let beside = area.width >= LEAST_WITH_SIGNALS;
+    let mut entries = Vec::with_capacity(rows.len());
+    app.fixed_order.clear();
+    for row in rows {
+        let key = (row.channel, row.frame.id());
+        app.fixed_order.push(key);
+        entries.push(Entry::Row(row));
+        if app.opened.contains(&key) {
+            let signals = seen.signals.in_frame(row.channel, &row.frame);
+            app.fixed_order.extend(signals.iter().map(|_| key));
+            entries.extend(signals.into_iter().map(Entry::Signal));
+        }
+    }
+    let heading = heading(app, seen, ascii, hidden);
+    list(frame, area, app, heading, entries.len(), |index, app| match &entries[index] {
+        Entry::Row(row) => line(row, ascii, beside, app, seen),
+        Entry::Signal(signal) => signal_line(signal, app.theme),
+    });
+}
+
+/// The headings; where those that sort stand is noted for clicks.
+fn heading(app: &mut App, seen: &Seen, ascii: bool, hidden: usize) -> Line<'static> {
+    let mut text = String::new();
+    app.sort_columns.clear();
+    for (title, sorts, width, left) in COLUMNS.into_iter().filter(|(title, ..)| ascii || *title != "ASCII") {
+        let title = format!("{title}{}", arrow(app, sorts));
+        let start = text.chars().count();
+        let width = if width == usize::MAX { title.chars().count() } else { width };
+        let cell = if left { format!("{title:<width$} ") } else { format!("{title:>width$} ") };
+        text.push_str(&cell);
+        if let Some(column) = sorts {
+            app.sort_columns.push((start as u16..text.chars().count() as u16, column));
+        }
+    }
+    match (hidden, seen.table.unlisted) {
+        (0, 0) => Line::from(text.trim_end().to_owned()),
+        (hidden, 0) => Line::from(format!("{text}({hidden} hidden)")),
+        (_, unlisted) => Line::from(format!("{text}({unlisted} frames of further IDs)")),
+    }
+}
+
+/// Which way the page is sorted by a column, if it is.
+fn arrow(app: &App, column: Option<Column>) -> &'static str {
+    match (app.theme.unicode, app.reverse) {
+        _ if column != Some(app.sort) => "",
+        (true, false) => "▾",
+        (true, true) => "▴",
+        (false, false) => "v",
+        (false, true) => "^",
+    }
+}
+
+/// A signal below its row.
+fn signal_line(signal: &Decoded, theme: Theme) -> Line<'static> {
+    let (arrow, style) = alarm(signal.alarm, theme);
+    Line::from(vec![
+        Span::styled(format!("{:13}{:<30} ", "", signal.name), theme.label()),
+        Span::styled(format!("{} {arrow}", signal.text), style),
+    ])
 }
 
 fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
@@ -76,7 +134,7 @@ fn name<'a>(row: &Row, seen: &'a Seen) -> &'a str {
     decoder.find(row.channel, row.frame.id()).map_or("", |message| &decoder.message(message).name)
 }
 
-fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
+fn line(row: &Row, ascii: bool, beside: bool, app: &App, seen: &Seen) -> Line<'static> {
     let theme = app.theme;
     let base = if row.mark > 0 { theme.series(usize::from(row.mark) - 1) } else { Style::new() };
     let period = row.period_ns.map_or("–".to_owned(), |ns| format!("{:.3}", ns / 1e6));
@@ -107,6 +165,9 @@ fn line(row: &Row, ascii: bool, app: &App, seen: &Seen) -> Line<'static> {
     let characters = if ascii { format!("{:<8} ", printable(data)) } else { String::new() };
     spans.push(Span::raw(format!("{:room$}{characters}", "")));
     spans.push(Span::styled(name(row, seen).to_owned(), base));
+    if beside {
+        spans.extend(in_line(&seen.signals.in_frame(row.channel, &row.frame), theme));
+    }
     Line::from(spans)
 }
 

@@ -5,38 +5,51 @@ use ratatui::layout::Rect;
 use ratatui::text::Line;
 use ratatui::widgets::{Block, Clear, Paragraph};
 
+use super::super::app::App;
 use super::super::theme::Theme;
 
-const KEYS: [(&str, &str); 19] = [
-    ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send, record"),
-    ("q, Ctrl-C", "leave"),
-    ("Space", "stop the display, go on; send: the entry on or off"),
-    ("c", "clear"),
-    ("t", "times: relative, delta, absolute"),
+/// Every key; `tests/help.rs` holds them to what the keys do.
+pub const KEYS: &[(&str, &str)] = &[
+    ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
+    ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
+    ("h ? F1", "this"),
+    ("Space", "stop the display or the file, go on; send: entry on or off"),
+    ("c  t", "clear; times: relative, delta, time of day (UTC)"),
     ("f", "show only some frames, by filters in candump's syntax"),
-    ("/  n  N", "trace: search, next older, next newer"),
+    ("/  n  N", "search this page, next, and the other way"),
     ("y", "trace: copy the selected frame"),
     ("arrows, Pg, End", "scroll; End is the newest"),
-    ("s  S  g", "fixed: sort by the next column, reverse, group by channel"),
-    ("#  *  H", "fixed: hide what changes anyway, show it again, heat of bits"),
+    ("s  S  g", "fixed, signals: sort, reverse, group; or click on headings"),
+    ("#  *  H", "fixed: hide what changes anyway, show it again, bits' heat"),
     ("x  u  o", "fixed: hide the row, show all, colour the row"),
-    ("Enter", "signals: into the graph; send: send once"),
-    ("+ -, arrows", "graph: zoom, cursor"),
+    ("Enter", "trace, fixed: signals; signals: into the graph; send: once"),
+    ("F", "signals: show only some, by name, value, alarm"),
+    ("+ -  ↑ ↓ wheel", "graph: zoom, around the cursor or the mouse"),
+    ("← → PgUp PgDn", "graph: move the cursor or pan; Home is oldest, End follows"),
+    ("x  a  s  Esc", "graph: cursors, show all, steps or lines, no cursors"),
     ("a  e  d", "send: add, edit, delete"),
-    ("m", "listen-only or normal"),
+    ("m  R", "listen-only or normal; bring a bus-off channel back"),
     ("r", "start or stop recording"),
     ("b  A  D", "bit rates, find the bit rates by listening, device"),
+    ("O  w  W", "open a database, or a trace beside; next source; close it"),
     (",  .  p  >  l", "file: slower, faster, stop, one frame, loop"),
+    ("[  ]  T", "file: 10 s back, 10 s on, go to a time"),
+    ("B  {  }", "bookmark here, go to the one before, after"),
 ];
 
-/// Draws the help over the page.
-pub fn draw(frame: &mut Frame<'_>, area: Rect) {
+/// Draws the help over the page; the arrows show what has no room.
+pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App) {
     let width = area.width.min(92);
     let height = area.height.min(KEYS.len() as u16 + 2);
     let place =
         Rect { x: area.x + (area.width - width) / 2, y: area.y + (area.height - height) / 2, width, height };
-    let lines: Vec<_> = KEYS.iter().map(|(keys, what)| Line::from(format!(" {keys:<15} {what}"))).collect();
+    let hidden = KEYS.len().saturating_sub(usize::from(height.saturating_sub(2)));
+    app.help_first = app.help_first.min(hidden);
+    let shown = KEYS.iter().skip(app.help_first);
+    let lines: Vec<_> = shown.map(|(keys, what)| Line::from(format!(" {keys:<16} {what}"))).collect();
     frame.render_widget(Clear, place);
-    let block = Block::bordered().title(" Keys, any key closes ").title_style(Theme::heading());
+    let title =
+        if hidden > 0 { " Keys; ↑ ↓ show more, any key closes " } else { " Keys, any key closes " };
+    let block = Block::bordered().title(title).title_style(Theme::heading());
     frame.render_widget(Paragraph::new(lines).block(block), place);
 }

@@ -5,7 +5,7 @@ use ratatui::layout::Rect;
 use ratatui::text::Line;
 use ratatui::widgets::Paragraph;
 
-use super::super::app::App;
+use super::super::app::{App, first_row};
 use super::super::theme::Theme;
 
 /// A number of bytes for people.
@@ -16,11 +16,6 @@ pub fn bytes(bytes: u64) -> String {
         10_000_000..10_000_000_000 => format!("{} MB", bytes / 1_000_000),
         _ => format!("{} GB", bytes / 1_000_000_000),
     }
-}
-
-/// The first row to show so that the selected one is on the page.
-pub fn first_row(selected: usize, rows: usize) -> usize {
-    selected.saturating_sub(rows.saturating_sub(1))
 }
 
 /// Lines below a heading, from the first row that keeps the selected one in sight.

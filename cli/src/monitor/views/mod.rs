@@ -23,8 +23,6 @@ use super::app::{App, View};
 use super::model::Model;
 use super::theme::Theme;
 
-pub use list::first_row;
-
 /// The smallest screen that anything fits on.
 pub const LEAST: (u16, u16) = (40, 8);
 
@@ -44,7 +42,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     ])
     .areas(area);
     frame.render_widget(Paragraph::new(tabs(app)).style(Theme::bar()), top);
-    frame.render_widget(Paragraph::new(state::line(app, model)), state);
+    state::draw(frame, state, app, model);
     // While the display is stopped, the pages show what was seen then.
     let frozen = app.frozen.take();
     let seen = frozen.as_deref().unwrap_or(&model.seen);
@@ -60,7 +58,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
     app.frozen = frozen;
     bottom::draw(frame, body, bottom, app, model);
     if app.help {
-        help::draw(frame, area);
+        help::draw(frame, area, app);
     }
     if !app.theme.unicode {
         make_ascii(frame.buffer_mut());
@@ -73,8 +71,12 @@ fn make_ascii(buffer: &mut Buffer) {
         let plain = match cell.symbol() {
             symbol if symbol.is_ascii() => continue,
             "─" | "–" => "-",
-            "│" => "|",
-            "┌" | "┐" | "└" | "┘" => "+",
+            "━" => "=",
+            "●" => "o",
+            "◆" => "B",
+            "│" | "╵" => "|",
+            "Δ" => "d",
+            "┤" | "┌" | "┐" | "└" | "┘" => "+",
             "▸" | "→" => ">",
             "←" => "<",
             "↑" => "^",
@@ -96,14 +98,9 @@ fn tabs(app: &App) -> Line<'static> {
         let style = if view == app.view { Theme::heading() } else { Style::new() };
         spans.push(Span::styled(text, style));
     }
+    let (this, all) = app.beside;
+    if all > 1 {
+        spans.push(Span::styled(format!("w {this} of {all}"), Theme::heading()));
+    }
     Line::from(spans)
-}
-
-/// The page whose tab is in this column.
-pub fn tab_at(column: u16) -> Option<View> {
-    let mut end = 1;
-    View::ALL.into_iter().find(|view| {
-        end += view.title().len() as u16 + 3;
-        column < end
-    })
 }

@@ -52,6 +52,12 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
         bytes(used as u64),
         bytes(most as u64)
     )));
+    let (values, used, most) = seen.signals.graph_memory();
+    lines.push(Line::from(format!(
+        "Graph     {values} values, {} of {}",
+        bytes(used as u64),
+        bytes(most as u64)
+    )));
     app.page_rows = usize::from(area.height);
     // Scrolled with the arrows where the screen is small.
     let most = lines.len().saturating_sub(app.page_rows);

@@ -5,7 +5,7 @@ use std::fmt::Write as _;
 use cantap::wire::record::ErrorState;
 use cantap::{TraceEvent, TraceRecord};
 use ratatui::Frame;
-use ratatui::layout::Rect;
+use ratatui::layout::{Constraint, Layout, Rect};
 use ratatui::style::Style;
 use ratatui::text::{Line, Span};
 use ratatui::widgets::Paragraph;
@@ -14,11 +14,17 @@ use super::super::app::{App, TimeMode};
 use super::super::event_text::{event_text, hex, lost, printable};
 use super::super::model::Model;
 use super::super::theme::Theme;
+use super::super::times::{clock, seconds};
 use super::list::bytes;
+use super::signals::{alarm, in_line};
+
+/// Where a frame's signals have room beside the data.
+const LEAST_WITH_SIGNALS: u16 = 120;
 
 /// Draws the page.
 pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
     let history = &model.history;
+    let area = if app.record_opened { opened(frame, area, app, model) } else { area };
     let rows = usize::from(area.height).saturating_sub(1) as u64;
     app.page_rows = rows as usize;
     let (first, end) = (history.first(), history.end());
@@ -54,37 +60,66 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model) {
             continue;
         };
         let before = number.checked_sub(1).and_then(|number| history.get(number));
-        let line = line(&record, before.as_ref(), app, model);
+        let mut line = line(&record, before.as_ref(), app, model);
+        if area.width >= LEAST_WITH_SIGNALS
+            && let Some(frame) = record.frame()
+        {
+            line.spans.extend(in_line(&model.seen.signals.in_frame(record.channel, frame), app.theme));
+        }
         lines.push(if app.cursor == Some(number) { line.style(Theme::bar()) } else { line });
     }
     frame.render_widget(Paragraph::new(lines), area);
 }
 
+/// The signals of the selected record, or of the newest, below the page; returns what is left of it.
+fn opened(frame: &mut Frame<'_>, area: Rect, app: &App, model: &Model) -> Rect {
+    let place = app.cursor.or(model.history.end().checked_sub(1));
+    let record = place.and_then(|place| model.history.get(place));
+    let of_frame = record.and_then(|record| Some((record, *record.frame()?)));
+    let mut lines = vec![
+        match (&of_frame, record) {
+            (Some((record, frame)), _) => {
+                let name = model.seen.signals.name_of(record).unwrap_or("in no database");
+                Line::from(format!("{} {}  {name}", record.channel, frame.id()))
+            }
+            (None, Some(record)) => Line::from(event_text(&record.event)),
+            (None, None) => Line::from("nothing is selected"),
+        }
+        .style(Theme::bar()),
+    ];
+    for signal in of_frame
+        .map(|(record, frame)| model.seen.signals.in_frame(record.channel, &frame))
+        .unwrap_or_default()
+    {
+        let (arrow, style) = alarm(signal.alarm, app.theme);
+        lines.push(Line::from(vec![
+            Span::styled(format!("  {:<30} ", signal.name), app.theme.label()),
+            Span::styled(format!("{} {arrow}", signal.text), style),
+        ]));
+    }
+    let height = (lines.len() as u16).min(area.height / 2);
+    let [rest, place] = Layout::vertical([Constraint::Min(1), Constraint::Length(height)]).areas(area);
+    frame.render_widget(Paragraph::new(lines), place);
+    rest
+}
+
 fn time_heading(mode: TimeMode) -> &'static str {
     match mode {
-        TimeMode::Absolute => "Time (s, UTC)",
+        TimeMode::Absolute => "Time (UTC)",
         TimeMode::Relative => "Time (s)",
         TimeMode::Delta => "Delta (s)",
     }
 }
 
-/// A time in seconds with six decimals.
-pub fn seconds(ns: i64) -> String {
-    let sign = if ns < 0 { "-" } else { "" };
-    let us = ns.unsigned_abs() / 1000;
-    format!("{sign}{}.{:06}", us / 1_000_000, us % 1_000_000)
-}
-
 fn line(record: &TraceRecord, before: Option<&TraceRecord>, app: &App, model: &Model) -> Line<'static> {
     let theme = app.theme;
+    let since = |ns: i64| seconds(record.time_ns.saturating_sub(ns));
     let time = match app.time_mode {
-        TimeMode::Absolute => record.time_ns,
-        TimeMode::Relative => record.time_ns.saturating_sub(model.first_ns.unwrap_or(0)),
-        TimeMode::Delta => {
-            record.time_ns.saturating_sub(before.map_or(record.time_ns, |before| before.time_ns))
-        }
+        TimeMode::Absolute => clock(record.time_ns, 6),
+        TimeMode::Relative => since(model.first_ns.unwrap_or(0)),
+        TimeMode::Delta => since(before.map_or(record.time_ns, |before| before.time_ns)),
     };
-    let start = format!("{:>17} {} ", seconds(time), record.channel);
+    let start = format!("{time:>17} {} ", record.channel);
     let TraceEvent::Frame { frame, direction, late } = record.event else {
         let text = format!("{start}{}", event_text(&record.event));
         return Line::styled(text, event_style(&record.event, theme));
@@ -119,11 +154,4 @@ fn event_style(event: &TraceEvent, theme: Theme) -> Style {
         TraceEvent::State { state: ErrorState::Active, .. } => theme.label(),
         _ => theme.error(),
     }
-}
-
-/// The record as candump writes it.
-pub fn candump_line(model: &Model, number: u64) -> Option<String> {
-    let record = model.history.get(number)?;
-    let frame = record.frame()?;
-    Some(format!("({}) {} {frame}", seconds(record.time_ns), cantap_trace::Interface(record.channel)))
 }

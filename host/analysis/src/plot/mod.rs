@@ -12,7 +12,7 @@ mod html;
 mod layout;
 mod model;
 mod png;
-mod scale;
+pub mod scale;
 mod scene;
 mod series;
 mod svg;

@@ -32,7 +32,7 @@ pub(super) fn with_margin((low, high): (f64, f64)) -> (f64, f64) {
 }
 
 /// Ticks in a range, about `wanted` of them, at multiples of 1, 2 or 5 times a power of ten, and the step.
-pub(super) fn ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
+pub fn ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     let rough = (high - low) / wanted.max(1) as f64;
     let power = 10f64.powf(rough.log10().floor());
     let step = [1.0, 2.0, 5.0, 10.0].map(|factor| factor * power).into_iter().find(|step| *step >= rough);
@@ -46,7 +46,7 @@ pub(super) fn whole_ticks(range: (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
 }
 
 /// Ticks for seconds: as [`ticks`] up to a second, then parts of minutes, hours and days.
-pub(super) fn time_ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
+pub fn time_ticks((low, high): (f64, f64), wanted: usize) -> (Vec<f64>, f64) {
     const STEPS: [f64; 21] = [
         2.0,
         5.0,
@@ -88,7 +88,7 @@ fn multiples((low, high): (f64, f64), step: f64) -> (Vec<f64>, f64) {
 }
 
 /// A value with as many decimals as a tick's step needs.
-pub(super) fn label(value: f64, step: f64) -> String {
+pub fn label(value: f64, step: f64) -> String {
     let magnitude = value.abs().max(step.abs());
     if magnitude >= 1e7 || (magnitude > 0.0 && magnitude < 1e-4) {
         return if value == 0.0 { "0".to_owned() } else { format!("{value:.2e}") };

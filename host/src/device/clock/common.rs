@@ -13,8 +13,10 @@ use super::{ClockMap, FrameClock, FrameDoubt};
 const TURN_NS: i64 = 2_048_000_000;
 /// What two devices' frame times may differ by at one UTC beside what UTC is known to.
 const MARGIN_NS: i64 = 500_000;
-/// Moments that are compared.
+/// Moments that are compared: marks of the first device, about one a second.
 const MOMENTS: usize = 256;
+/// The newest of them, which are judged by themselves too: frames that have run apart are to be noticed within seconds.
+const NEWEST: usize = 5;
 
 /// Why two devices have no clock in common.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
@@ -43,52 +45,75 @@ pub struct CommonClock {
     /// The second device's frame time less the first's: whole turns.
     turns_ns: i64,
     disagreement_ns: i64,
+    outliers: usize,
+}
+
+/// A device's mark with its UTC.
+struct Dated {
+    utc: i64,
+    /// How far off that may be.
+    unsure_ns: i64,
+    frame: FrameNs,
+}
+
+/// Two devices' frame times at one UTC.
+#[derive(Clone, Copy)]
+struct Moment {
+    difference_ns: i64,
+    /// What they may differ by beside whole turns.
+    known_ns: i64,
+}
+
+impl Moment {
+    fn off_ns(&self, turns_ns: i64) -> i64 {
+        (self.difference_ns - turns_ns).abs()
+    }
 }
 
 impl CommonClock {
     /// Of two devices whose maps have marks and round trips of the same minutes.
     ///
-    /// Each of the last marks is a moment that is compared, so that frames which run apart are noticed. To be repeated
-    /// after a device's marks were interrupted, since it may then count from another turn.
+    /// Each of the last marks is a moment that is compared, by what was known of UTC then. What most of them say is so, and
+    /// what most of the newest say: a mark or an answer that was late once is counted ([`Self::outliers`]) and decides nothing,
+    /// and frames that run apart are noticed within seconds. To be repeated after a device's marks were interrupted, since it may
+    /// then count from another turn.
     pub fn between(first: &ClockMap, second: &ClockMap) -> Result<Self, NotCommon> {
-        let unsure = |map: &ClockMap| map.report().uncertainty_ns.unwrap_or(0);
-        let known_ns = MARGIN_NS + unsure(first) + unsure(second);
-        Self::by_utc(first.frames(), |at| first.utc(at).0, second.frames(), |at| second.utc(at).0, known_ns)
-    }
-
-    /// The same for any clocks, whose ticks the functions map to one time in nanoseconds, so well that two of them differ
-    /// by no more than `known_ns` at one moment.
-    pub fn by_utc(
-        first: &FrameClock,
-        first_utc: impl Fn(Ticks) -> i64,
-        second: &FrameClock,
-        second_utc: impl Fn(Ticks) -> i64,
-        known_ns: i64,
-    ) -> Result<Self, NotCommon> {
-        for frames in [first, second] {
+        for frames in [first.frames(), second.frames()] {
             let last = frames.marks().next_back().map_or(Ticks(0), |(at, _)| at);
             frames.trust(last).map_err(NotCommon::Doubt)?;
         }
-        let dated = |frames: &FrameClock, utc: &dyn Fn(Ticks) -> i64| -> Vec<(i64, FrameNs)> {
-            frames.marks().map(|(at, frame)| (utc(at), frame)).collect()
+        let dated = |map: &ClockMap| -> Vec<Dated> {
+            let date = |(at, frame)| {
+                let (utc, unsure_ns) = map.utc_within(at);
+                Dated { utc: utc.0, unsure_ns, frame }
+            };
+            map.frames().marks().map(date).collect()
         };
-        let (first, second) = (dated(first, &first_utc), dated(second, &second_utc));
-        let mut differences: Vec<i64> = first
-            .iter()
-            .rev()
-            .filter_map(|(utc, frame)| Some(interpolated(&second, *utc)?.since(*frame)))
-            .take(MOMENTS)
-            .collect();
-        differences.sort_unstable();
-        let Some(middle) = differences.get(differences.len() / 2) else { return Err(NotCommon::Apart) };
-        let turns_ns = (middle + TURN_NS / 2).div_euclid(TURN_NS) * TURN_NS;
-        let off = |difference: i64| (difference - turns_ns).abs();
-        let disagreement_ns = differences.iter().copied().map(off).max().unwrap_or(0);
-        if disagreement_ns > known_ns {
-            let (off_us, known_us) = (disagreement_ns / 1000, known_ns / 1000);
-            return Err(NotCommon::Controllers { off_us, known_us });
+        let (first, second) = (dated(first), dated(second));
+        let compared = first.iter().rev().filter_map(|mark| {
+            let (frame, unsure_ns) = interpolated(&second, mark.utc)?;
+            let known_ns = MARGIN_NS + mark.unsure_ns + unsure_ns;
+            Some(Moment { difference_ns: frame.since(mark.frame), known_ns })
+        });
+        let newest_first: Vec<Moment> = compared.take(MOMENTS).collect();
+        let Some(usual_ns) = middle(&newest_first, |moment| moment.difference_ns) else {
+            return Err(NotCommon::Apart);
+        };
+        let turns_ns = (usual_ns + TURN_NS / 2).div_euclid(TURN_NS) * TURN_NS;
+        let outlies = |moment: &&Moment| moment.off_ns(turns_ns) > moment.known_ns;
+        let newest = &newest_first[..newest_first.len().min(NEWEST)];
+        for moments in [newest, &newest_first] {
+            if moments.iter().filter(outlies).count() * 2 > moments.len() {
+                let off_ns = middle(moments, |moment| moment.off_ns(turns_ns)).unwrap_or(0);
+                let known_ns = middle(moments, |moment| moment.known_ns).unwrap_or(0);
+                return Err(NotCommon::Controllers { off_us: off_ns / 1000, known_us: known_ns / 1000 });
+            }
         }
-        Ok(Self { turns_ns, disagreement_ns })
+        Ok(Self {
+            turns_ns,
+            disagreement_ns: newest_first.iter().map(|moment| moment.off_ns(turns_ns)).max().unwrap_or(0),
+            outliers: newest_first.iter().filter(outlies).count(),
+        })
     }
 
     /// The second device's time when the first one's is `ticks`. `None` if either has too few marks to tell.
@@ -102,16 +127,29 @@ impl CommonClock {
     }
 
     /// The most that the two devices' UTC, each by its own round trips, was apart from what the frames say, in nanoseconds: what
-    /// [`Self::between`] found out by, and what a common clock saves.
+    /// [`Self::between`] found out by, and what a common clock saves. Late marks and answers are in it.
     pub const fn disagreement_ns(&self) -> i64 {
         self.disagreement_ns
     }
+
+    /// How many of the moments compared were farther apart than what was known of UTC then allows: late marks, late answers.
+    pub const fn outliers(&self) -> usize {
+        self.outliers
+    }
 }
 
-/// The frame time at a UTC time between two marks.
-fn interpolated(marks: &[(i64, FrameNs)], utc: i64) -> Option<FrameNs> {
-    let next = marks.partition_point(|(at, _)| *at <= utc);
-    let ((from_utc, from), (to_utc, to)) = (marks.get(next.checked_sub(1)?)?, marks.get(next)?);
-    let share = (utc - from_utc) as f64 / (to_utc - from_utc) as f64;
-    Some(from.plus((to.since(*from) as f64 * share) as i64))
+/// The middle one of some values; `None` of none.
+fn middle(moments: &[Moment], value: impl Fn(&Moment) -> i64) -> Option<i64> {
+    let mut values: Vec<i64> = moments.iter().map(value).collect();
+    values.sort_unstable();
+    values.get(values.len() / 2).copied()
+}
+
+/// The frame time at a UTC time between two marks, and how far off that UTC may be.
+fn interpolated(marks: &[Dated], utc: i64) -> Option<(FrameNs, i64)> {
+    let next = marks.partition_point(|mark| mark.utc <= utc);
+    let (from, to) = (marks.get(next.checked_sub(1)?)?, marks.get(next)?);
+    let share = (utc - from.utc) as f64 / (to.utc - from.utc) as f64;
+    let frame = from.frame.plus((to.frame.since(from.frame) as f64 * share) as i64);
+    Some((frame, from.unsure_ns.max(to.unsure_ns)))
 }

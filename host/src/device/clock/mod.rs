@@ -95,6 +95,8 @@ struct Bend {
     at: Ticks,
     utc: UtcNs,
     ns_per_tick: f64,
+    /// How far off it may have been then.
+    unsure_ns: i64,
 }
 
 impl Bend {
@@ -122,7 +124,12 @@ impl ClockMap {
             nominal_ns_per_tick,
             round_trips: VecDeque::new(),
             frames: FrameClock::new(tick_hz),
-            bends: VecDeque::from([Bend { at: Ticks(0), utc, ns_per_tick: nominal_ns_per_tick }]),
+            bends: VecDeque::from([Bend {
+                at: Ticks(0),
+                utc,
+                ns_per_tick: nominal_ns_per_tick,
+                unsure_ns: 0,
+            }]),
             report: ClockReport::default(),
         }
     }
@@ -130,11 +137,23 @@ impl ClockMap {
     /// The UTC time of a device time. For one in the past it is what it was then, for the last 17 minutes.
     #[inline]
     pub fn utc(&self, ticks: Ticks) -> UtcNs {
+        self.bend_at(ticks).utc(ticks)
+    }
+
+    /// The same with how far off it may be, in nanoseconds, as was known then: the line of the past stays as it was, and what is known
+    /// better now does not make it better. 0 for a device that does not run in real time.
+    pub fn utc_within(&self, ticks: Ticks) -> (UtcNs, i64) {
+        let bend = self.bend_at(ticks);
+        (bend.utc(ticks), bend.unsure_ns)
+    }
+
+    #[inline]
+    fn bend_at(&self, ticks: Ticks) -> &Bend {
         let last = &self.bends[self.bends.len() - 1];
         if ticks.since(last.at) >= 0 {
-            return last.utc(ticks);
+            return last;
         }
-        self.bends[self.bends.partition_point(|bend| bend.at <= ticks).saturating_sub(1)].utc(ticks)
+        &self.bends[self.bends.partition_point(|bend| bend.at <= ticks).saturating_sub(1)]
     }
 
     /// The device time of a UTC time: [`Self::utc`] backwards, to the nearest tick.
@@ -156,8 +175,9 @@ impl ClockMap {
     /// Takes one round trip: the device's time, and UTC before the question and after the answer.
     pub fn add(&mut self, at: Ticks, asked: UtcNs, answered: UtcNs) {
         if self.round_trips.is_empty() {
-            let utc = asked.plus(answered.since(asked) / 2);
-            self.bends = VecDeque::from([Bend { at, utc, ns_per_tick: self.nominal_ns_per_tick }]);
+            let half_ns = answered.since(asked) / 2;
+            let (utc, ns_per_tick) = (asked.plus(half_ns), self.nominal_ns_per_tick);
+            self.bends = VecDeque::from([Bend { at, utc, ns_per_tick, unsure_ns: half_ns }]);
         }
         if self.round_trips.len() == GATES {
             self.round_trips.pop_front();
@@ -203,7 +223,7 @@ impl ClockMap {
         self.report.source = trust.map_or_else(ClockSource::RoundTrips, |()| ClockSource::Frames);
         let Some(line) = line else {
             // It does not run in real time. Its frames are as far apart as it says.
-            self.push(Bend { at: now, utc: at, ns_per_tick: self.nominal_ns_per_tick });
+            self.push(Bend { at: now, utc: at, ns_per_tick: self.nominal_ns_per_tick, unsure_ns: 0 });
             let ClockReport { source, round_trip_ns, .. } = self.report;
             self.report = ClockReport { source, round_trip_ns, ..ClockReport::default() };
             return;
@@ -212,14 +232,14 @@ impl ClockMap {
         let (correction, utc) =
             if catch_up_ns > 0.0 { (correction, at) } else { (0.0, at.plus(line.now_ns as i64)) };
         let true_ns_per_tick = ruler * (1.0 + line.rate);
-        self.push(Bend { at: now, utc, ns_per_tick: true_ns_per_tick * (1.0 + correction) });
+        let off_ns = utc.since(at) as f64;
+        let unsure_ns = (line.range_ns.1 - off_ns).abs().max((off_ns - line.range_ns.0).abs()).ceil() as i64;
+        self.push(Bend { at: now, utc, ns_per_tick: true_ns_per_tick * (1.0 + correction), unsure_ns });
         let faster_ppm = |utc_per_nominal: f64| (1.0 / utc_per_nominal - 1.0) * 1e6;
         let sure = line.rate_doubt * 1e6 <= MAX_DOUBT_PPM;
-        let off_ns = utc.since(at) as f64;
         self.report.drift_ppm = sure.then(|| faster_ppm(rate * (1.0 + line.rate)));
         self.report.frames_ppm = (sure && trust.is_ok()).then(|| faster_ppm(1.0 + line.rate));
-        self.report.uncertainty_ns =
-            Some((line.range_ns.1 - off_ns).abs().max((off_ns - line.range_ns.0).abs()).ceil() as i64);
+        self.report.uncertainty_ns = Some(unsure_ns);
     }
 
     fn push(&mut self, bend: Bend) {

@@ -307,3 +307,70 @@ fn devices_on_two_controllers_are_not_put_on_one_clock() {
     let (silent, ..) = follow(&EXACT, 100, usual, no_marks);
     assert_eq!(CommonClock::between(&here, &silent), Err(NotCommon::Doubt(FrameDoubt::NoMarks)));
 }
+
+/// A computer that was busy in the first seconds did not know UTC well then. What it knows minutes later does not make the times of
+/// then better, and they must not be held against it.
+#[test]
+fn a_bad_beginning_does_not_put_two_devices_on_two_controllers() {
+    let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
+    let map = |ppm: f64, busy_s: i64| {
+        let delays =
+            move |second: i64| if second < busy_s { (100_000, 20_000_000) } else { (100_000, 200_000) };
+        follow(&Simulated { ppm, ..controller }, 200, delays, all_marks).0
+    };
+    let (first, second) = (map(40.0, 0), map(-40.0, 5));
+    let common = CommonClock::between(&first, &second).unwrap();
+    assert!(common.disagreement_ns() > 5_000_000, "{common:?}: it begins 10 ms off");
+    assert_eq!(common.outliers(), 0, "{common:?}");
+}
+
+/// One device's UTC was wrong for three seconds, as after an answer that was late in a way that nobody could know of, and one mark was as
+/// late as marks are taken. They are counted, and do not undo what minutes say.
+#[test]
+fn a_time_that_is_wrong_once_is_counted_and_decides_nothing() {
+    let controller = Simulated { frames_ppm: 35.0, jitter_ns: 100.0, ..EXACT };
+    let here = follow(&Simulated { ppm: 40.0, ..controller }, 300, usual, all_marks).0;
+    let late_mark = |second: i64, mark: SofMark| {
+        Some(if second == 290 { SofMark { at: mark.at.plus(55), ..mark } } else { mark })
+    };
+    let mut there = follow(&Simulated { ppm: -40.0, ..controller }, 300, usual, late_mark).0;
+    let quiet = CommonClock::between(&here, &there).unwrap();
+    assert_eq!(quiet.outliers(), 0, "{quiet:?}");
+    for bend in there.bends.iter_mut().skip(280).take(3) {
+        bend.utc = bend.utc.plus(5_000_000);
+    }
+    let common = CommonClock::between(&here, &there).unwrap();
+    assert_eq!(common.outliers(), 3, "{common:?}");
+    let mapped =
+        |common: CommonClock| common.to_second(here.frames(), here.ticks(utc(200 * S)), there.frames());
+    assert_eq!(mapped(common), mapped(quiet));
+    assert!(common.disagreement_ns() >= 4_000_000, "{common:?}: not hidden");
+}
+
+/// Two controllers that happened to count alike: their crystals part them, and the last seconds tell, not the minutes before.
+#[test]
+fn frames_that_run_apart_are_noticed_within_seconds() {
+    let first = Simulated { ppm: 40.0, ..EXACT };
+    let second = Simulated { ppm: -40.0, frames_ppm: 10.0, ..EXACT };
+    let known_ns = |seconds: i64| {
+        let map = |device: &Simulated| follow(device, seconds, |_| (100_000, 200_000), all_marks).0;
+        let (here, there) = (map(&first), map(&second));
+        let unsure = |map: &ClockMap| map.report().uncertainty_ns.unwrap();
+        (CommonClock::between(&here, &there), 500_000 + unsure(&here) + unsure(&there))
+    };
+    let mut noticed = None;
+    for seconds in (20..250).step_by(3) {
+        let (common, known_ns) = known_ns(seconds);
+        // 10 µs a second.
+        let apart_ns = seconds * 10_000;
+        if let Err(reason) = common {
+            assert!(matches!(reason, NotCommon::Controllers { .. }), "{reason}");
+            assert!(apart_ns > known_ns, "at {seconds} s: {apart_ns} of {known_ns} ns");
+            noticed = noticed.or(Some((seconds, apart_ns - known_ns)));
+        } else {
+            assert_eq!(noticed, None, "at {seconds} s");
+        }
+    }
+    let (seconds, late_ns) = noticed.expect("noticed");
+    assert!(late_ns < 100_000, "only at {seconds} s, {late_ns} ns beyond what is known");
+}

@@ -31,6 +31,8 @@ use crate::simbus::{Senders, arbitration_field};
 pub const DATABASE: &str = include_str!("car.dbc");
 /// What the database is called where a file's name is expected.
 pub const DATABASE_NAME: &str = "virtual:car";
+/// What the device calls its board, so that whoever meets it at a serial port knows whose signals it has.
+pub const BOARD: &str = "virtual-car";
 /// The buses' bit rates: drive train, body.
 pub const BITRATES_BPS: [u32; 2] = [500_000, 125_000];
 
@@ -44,7 +46,7 @@ const PACKET_GAP_NS: u64 = 60 * MS_NS;
 /// The car begins to send when its ECUs have started.
 const START_NS: u64 = 120 * MS_NS;
 const MS_NS: u64 = 1_000_000;
-/// An ECU's times are off by so much of a cycle, at most, and by no more than [`MAX_JITTER_NS`].
+/// How much of a cycle an ECU's times are off, at most, and by no more than [`MAX_JITTER_NS`].
 const JITTER_PER_MILLE: u64 = 15;
 const MAX_JITTER_NS: u64 = 900_000;
 /// Error counts (ISO 11898-1:2015, 12.1.4) and how long an ECU stays away when it is bus-off.

@@ -4,6 +4,7 @@ use cantap_wire::record::BusErrorKind;
 use cantap_wire::{Frame, Id};
 
 use super::Traffic;
+use super::waveform::{Edge, Waveform};
 use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 
 /// From an error to the next chance to send: six to twelve bits of error flags, eight of delimiter, three of
@@ -11,6 +12,8 @@ use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 const ERROR_FRAME_BITS: u64 = 9 + 8 + 3;
 /// Bits of a frame behind the ACK slot: its delimiter and the end of frame.
 const AFTER_ACK_BITS: u32 = 1 + 7;
+/// The bit rate of a bus that has none of its own, while it is only watched.
+const WATCHED_BPS: u32 = 500_000;
 /// "Never", for times.
 const NEVER: u64 = u64::MAX;
 
@@ -57,6 +60,9 @@ pub struct SimBus {
     disturbed: u32,
     random: fastrand::Rng,
     phase: Phase,
+    /// Somebody watches the level, which no controller needs to be on the bus for.
+    watched: bool,
+    waveform: Waveform,
 }
 
 impl SimBus {
@@ -70,7 +76,22 @@ impl SimBus {
             disturbed: 0,
             random: fastrand::Rng::with_seed(seed),
             phase: Phase::Free { from_ns: 0 },
+            watched: false,
+            waveform: Waveform::default(),
         }
+    }
+
+    /// Whether somebody watches the level: [`Self::pass_edge`] is then called often.
+    pub fn watch(&mut self, watched: bool) {
+        if self.watched != watched {
+            self.watched = watched;
+            self.waveform = Waveform::default();
+        }
+    }
+
+    /// The next edge whose time has come; each is handed out once.
+    pub fn pass_edge(&mut self, now_ns: u64) -> Option<Edge> {
+        self.waveform.pass(now_ns)
     }
 
     /// Whether the simulated nodes acknowledge what others send. They do unless told otherwise.
@@ -128,9 +149,10 @@ impl SimBus {
         matches!(self.phase, Phase::Free { .. })
     }
 
-    /// The bus's bit rate, once anybody takes part. Simulated nodes are silent while nobody listens.
+    /// The bus's bit rate, once a node takes part. Simulated nodes are silent while none listens.
     fn rate(&self, nodes: &[&mut dyn Node]) -> Option<u32> {
-        let joined = nodes.iter().find_map(|node| node.bitrate_bps())?;
+        let watched = self.watched.then_some(WATCHED_BPS);
+        let joined = nodes.iter().find_map(|node| node.bitrate_bps()).or(watched)?;
         Some(self.bitrate_bps.unwrap_or(joined))
     }
 
@@ -165,6 +187,9 @@ impl SimBus {
                 (end, end + ERROR_FRAME_BITS)
             }
         };
+        if self.watched {
+            self.waveform.frame(&frame, now_ns, bitrate_bps, error.map(|error| (error, end)));
+        }
         self.phase = Phase::Busy { frame, sender, error, end_ns: at(end), free_ns: at(free) };
     }
 

@@ -22,7 +22,7 @@ pub trait Senders: Debug {
     fn delivered(&mut self);
     /// It was destroyed.
     fn destroyed(&mut self, frame: &Frame, now_ns: u64);
-    /// A frame of somebody else has ended well.
+    /// Another node's frame has ended well.
     fn hear(&mut self, frame: &Frame, now_ns: u64);
 }
 

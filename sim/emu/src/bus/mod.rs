@@ -10,6 +10,7 @@ pub mod node;
 pub mod outcome;
 pub mod sampling;
 mod start;
+mod waveform;
 
 use std::collections::VecDeque;
 
@@ -22,6 +23,8 @@ use crate::can::{CanPair, Mode};
 pub use node::{BitTime, Node, Source};
 use outcome::Detection;
 pub use outcome::Disturbance;
+pub use waveform::Edge;
+use waveform::Waveform;
 
 /// Recessive bits after which a node may take part, and of which bus-off needs 128 sequences.
 const SYNC_BITS: u64 = 11;
@@ -100,6 +103,7 @@ pub struct Wire {
     noise: (f64, Rng),
     started: u64,
     history: Vec<BusFrame>,
+    waveform: Waveform,
 }
 
 /// A bus held dominant: when its listeners count the next error.
@@ -122,6 +126,7 @@ impl Wire {
             noise: (0.0, Rng::with_seed(0)),
             started: 0,
             history: Vec::new(),
+            waveform: Waveform::default(),
         }
     }
 
@@ -137,6 +142,11 @@ impl Wire {
         &mut self.nodes[number]
     }
 
+    /// The emulated controllers on it.
+    pub fn controllers(&self) -> &[usize] {
+        &self.attached
+    }
+
     /// How many nodes there are.
     pub fn node_count(&self) -> usize {
         self.nodes.len()
@@ -150,6 +160,21 @@ impl Wire {
     /// Takes the history out, so that a long run needs little memory.
     pub fn take_history(&mut self) -> Vec<BusFrame> {
         std::mem::take(&mut self.history)
+    }
+
+    /// Makes edges to recessive come later than they should by so many core cycles, as on a bus with much capacitance.
+    pub fn slow_recessive(&mut self, cycles: u64) {
+        self.waveform.slow_recessive = cycles;
+    }
+
+    /// When the level changes next, as far as that is known.
+    pub fn next_edge(&self) -> Option<u64> {
+        self.waveform.next().map(|edge| edge.at)
+    }
+
+    /// The next edge whose time has come; each is handed out once.
+    pub fn pass_edge(&mut self, now: u64) -> Option<Edge> {
+        self.waveform.pass(now)
     }
 
     /// Destroys a share of all frames from now on, 0 to 1, each at a bit that `seed` decides.
@@ -168,6 +193,7 @@ impl Wire {
         let bit = self.listener_bit(can);
         if hold && self.stuck.is_none() {
             self.abort_flight(can);
+            self.waveform.hold(self.now, true);
             // Six dominant bits are a stuff error.
             self.stuck = Some(Stuck { next_error: self.now + bit.cycles(6) });
             // An error frame ends with eight recessive bits: until then a controller is busy, and leaves the bus for no request.
@@ -175,6 +201,7 @@ impl Wire {
                 can.controllers[*n].bus_stuck();
             }
         } else if !hold && self.stuck.take().is_some() {
+            self.waveform.hold(self.now, false);
             self.recessive = self.now;
             self.free = self.now + bit.cycles(SYNC_BITS);
             for n in &self.attached {
@@ -183,7 +210,7 @@ impl Wire {
         }
     }
 
-    /// When [`Self::advance`] is wanted next.
+    /// When [`Self::advance`] must be called next.
     pub fn next_event(&self, can: &CanPair) -> Option<u64> {
         if let Some(stuck) = &self.stuck {
             return Some(stuck.next_error);

@@ -77,6 +77,7 @@ impl Wire {
         let disturbance = self.take_disturbance();
         let outcome = FrameEnd::of(bits, &participants, disturbance);
         count_dominant(&contest, &members, &participants, &outcome, can);
+        self.waveform.frame(start, bit, bits, &participants, &outcome);
 
         let at = |bits: usize| start + bit.cycles(bits as u64);
         let mut steps: Vec<(u64, Step)> = contest

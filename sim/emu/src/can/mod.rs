@@ -76,7 +76,7 @@ impl CanPair {
         self.controllers[n].irqs()
     }
 
-    /// When [`Self::advance`] is wanted next: only loop-back needs it.
+    /// When [`Self::advance`] must be called next: only loop-back needs it.
     pub fn next_event(&self) -> Option<u64> {
         self.controllers.iter().filter_map(Controller::loopback_event).min()
     }

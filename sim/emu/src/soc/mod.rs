@@ -1,6 +1,7 @@
 //! The chip around the core: address decode, clock gating, interrupt lines, and the two CAN buses connected to it. An access to a register that no model knows is noted, never silently swallowed.
 
 pub mod bootloader;
+pub mod exti;
 pub mod flash;
 pub mod rcc;
 pub mod small;
@@ -18,6 +19,7 @@ use crate::memory_map as map;
 use crate::rom;
 use crate::timing::Speeds;
 use crate::{Clock, Peripheral};
+use exti::Exti;
 use flash::FlashInterface;
 use rcc::{Crystal, Rcc, ResetCause};
 use small::{Adc, Crc, Gpio, Storage, Watchdog};
@@ -27,6 +29,8 @@ use timer::Timer;
 const PORTS: usize = 9;
 /// TIM2 to TIM7: bits of the counter and interrupt number (RM0090 Rev 21 Table 61).
 const TIMERS: [(u32, u16); 6] = [(32, 28), (16, 29), (16, 30), (32, 50), (16, 54), (16, 55)];
+/// Where the buses arrive unless it is said otherwise: PB8 and PB12.
+pub const RECEIVE_PINS: [(usize, u32); 2] = [(1, 8), (1, 12)];
 /// Interrupt numbers of CAN1 and CAN2: transmit, FIFO 0, FIFO 1, status change and error.
 pub const CAN_IRQS: [[u16; 4]; 2] = [[19, 20, 21, 22], [63, 64, 65, 66]];
 
@@ -108,11 +112,13 @@ pub struct Board {
     adc: Adc,
     power: Storage,
     syscfg: Storage,
-    exti: Storage,
+    exti: Exti,
+    /// Where each bus arrives: port (0 for A) and pin.
+    receive_pins: [(usize, u32); 2],
     crc: Crc,
     dbgmcu: Storage,
     devices: Vec<Device>,
-    /// Interrupt of the attached device that was last reached, until somebody asks.
+    /// Interrupt of the attached device that was last reached, until it is asked for.
     reached: Option<u16>,
     odd: BTreeMap<(Oddity, u32, bool), u64>,
     clock: Clock,
@@ -147,7 +153,8 @@ impl Board {
             adc: Adc::default(),
             power: power(),
             syscfg: syscfg(rom::FLASH),
-            exti: Storage::new(6, &[]),
+            exti: Exti::default(),
+            receive_pins: RECEIVE_PINS,
             crc: Crc::default(),
             dbgmcu: dbgmcu(),
             devices: Vec::new(),
@@ -165,6 +172,39 @@ impl Board {
         self.clock
     }
 
+    /// Connects the buses to other pins than [`RECEIVE_PINS`]: port (0 for A) and pin of each controller's RX.
+    pub fn receive_at(&mut self, pins: [(usize, u32); 2]) {
+        self.receive_pins = pins;
+    }
+
+    /// Whether an edge of controller `n`'s receive pin would interrupt.
+    pub fn watches(&self, n: usize) -> bool {
+        let (port, pin) = self.receive_pins[n];
+        self.exti.watches(pin) && self.exti_port(pin) == port
+    }
+
+    /// The port that a line of EXTI is led to.
+    fn exti_port(&self, line: u32) -> usize {
+        let sources = self.syscfg.read(8 + line / 4 * 4).unwrap_or(0);
+        (sources >> (line % 4 * 4) & 0xF) as usize
+    }
+
+    /// Lets the buses' edges up to now reach the pins, and what is behind those.
+    fn advance_pins(&mut self, now: u64) {
+        for wire in 0..self.wires.len() {
+            while let Some(edge) = self.wires[wire].pass_edge(now) {
+                for n in 0..self.wires[wire].controllers().len() {
+                    let (port, pin) = self.receive_pins[self.wires[wire].controllers()[n]];
+                    let inputs = &mut self.ports[port].inputs;
+                    *inputs = *inputs & !(1 << pin) | u16::from(!edge.dominant) << pin;
+                    if self.exti_port(pin) == port {
+                        self.exti.edge(pin, !edge.dominant);
+                    }
+                }
+            }
+        }
+    }
+
     /// Puts a device at a range of addresses, with an interrupt line.
     pub fn attach(&mut self, range: Range<u32>, irq: u16, model: Arc<Mutex<dyn Peripheral + Send>>) {
         self.devices.push(Device { range, irq, model });
@@ -177,7 +217,7 @@ impl Board {
         self.awaited = None;
         // The jumper for the ROM bootloader, if there was one, is out.
         self.boot_mode = rom::FLASH;
-        self.ports = (0..PORTS).map(Gpio::new).collect();
+        self.ports.iter_mut().for_each(Gpio::reset);
         self.flash = self.flash.after_reset();
         for timer in &mut self.timers {
             *timer = timer.after_reset();
@@ -186,7 +226,7 @@ impl Board {
         self.adc = Adc::default();
         self.power = power();
         self.syscfg = syscfg(self.boot_mode);
-        self.exti = Storage::new(6, &[]);
+        self.exti = Exti::default();
         self.crc = Crc::default();
         for controller in 0..2 {
             self.can.reset(controller);
@@ -299,15 +339,24 @@ impl Board {
         for device in &self.devices {
             set(device.irq, device.lock().irq());
         }
-        lines
+        lines | self.exti.lines()
     }
 
-    /// When [`Self::advance`] is wanted next.
+    /// When [`Self::advance`] must be called next.
     pub fn next_event(&self) -> Option<u64> {
         let wires = self.wires.iter().filter_map(|wire| wire.next_event(&self.can));
         let timers = self.timers.iter().filter_map(Timer::next_event);
         let devices = self.devices.iter().filter_map(|device| device.lock().next_event());
-        wires.chain(timers).chain(devices).chain(self.can.next_event()).chain(self.watchdog.deadline()).min()
+        // Where nobody watches, edges need not be on time.
+        let watched = |wire: &&Wire| wire.controllers().iter().any(|n| self.watches(*n));
+        let edges = self.wires.iter().filter(watched).filter_map(Wire::next_edge);
+        wires
+            .chain(edges)
+            .chain(timers)
+            .chain(devices)
+            .chain(self.can.next_event())
+            .chain(self.watchdog.deadline())
+            .min()
     }
 
     /// Lets everything happen that is due at or before `now`.
@@ -339,6 +388,7 @@ impl Board {
         for wire in &mut self.wires {
             wire.advance(now, &mut self.can);
         }
+        self.advance_pins(now);
     }
 
     /// Passes the clock tree on to those whose time depends on it.
@@ -427,8 +477,14 @@ impl Board {
             0x4000_7000 => self.power.read(offset),
             0x4001_2000 => self.adc.read(offset),
             0x4001_3800 => self.syscfg.read(offset),
-            0x4001_3C00 => self.exti.read(offset),
-            GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].read(offset),
+            0x4001_3C00 => {
+                self.advance_buses(now);
+                self.exti.read(offset)
+            }
+            GPIO_BASE..=0x4002_2000 => {
+                self.advance_buses(now);
+                self.ports[block(address, GPIO_BASE)].read(offset)
+            }
             0x4002_3000 => self.crc.read(offset),
             0x4002_3800 => {
                 self.awaited = None;
@@ -496,8 +552,14 @@ impl Board {
             }
             0x4000_7000 => self.power.write(offset, value),
             0x4001_2000 => self.adc.write(offset, value),
-            0x4001_3800 => self.syscfg.write(offset, value),
-            0x4001_3C00 => self.exti.write(offset, value),
+            0x4001_3800 => {
+                self.advance_buses(now);
+                self.syscfg.write(offset, value)
+            }
+            0x4001_3C00 => {
+                self.advance_buses(now);
+                self.exti.write(offset, value)
+            }
             GPIO_BASE..=0x4002_2000 => self.ports[block(address, GPIO_BASE)].write(offset, value),
             0x4002_3000 => self.crc.write(offset, value),
             0x4002_3800 => {
@@ -524,7 +586,7 @@ impl Board {
         match offset {
             0x10 => {
                 for port in (0..PORTS).filter(|port| set(*port)) {
-                    self.ports[port] = Gpio::new(port);
+                    self.ports[port].reset();
                 }
             }
             0x14 if set(7) => {

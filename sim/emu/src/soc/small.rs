@@ -6,6 +6,7 @@ use crate::Clock;
 /// A GPIO port (RM0090 Rev 21 §8). Pins in input mode read their external level, high by default.
 #[derive(Clone, Debug)]
 pub struct Gpio {
+    port: usize,
     registers: [u32; 10],
     /// External levels of the pins.
     pub inputs: u16,
@@ -19,9 +20,15 @@ const BSRR: usize = 6;
 impl Gpio {
     /// Port 0 (A), 1 (B) and so on after reset: the debug port's pins are set up.
     pub fn new(port: usize) -> Self {
-        let mut registers = [0; 10];
-        registers[MODER] = [0xA800_0000, 0x280].get(port).copied().unwrap_or(0);
-        Self { registers, inputs: u16::MAX }
+        let mut gpio = Self { port, registers: [0; 10], inputs: u16::MAX };
+        gpio.reset();
+        gpio
+    }
+
+    /// The registers as after reset; what is applied to the pins stays.
+    pub fn reset(&mut self) {
+        self.registers = [0; 10];
+        self.registers[MODER] = [0xA800_0000, 0x280].get(self.port).copied().unwrap_or(0);
     }
 
     /// Reads a register; `None` where there is none.
@@ -233,7 +240,7 @@ pub struct Storage {
 }
 
 impl Storage {
-    /// `count` registers that are zero, but for the bits `ones` (register, mask) that stay set.
+    /// `count` registers that are zero, except for the bits `ones` (register, mask) that stay set.
     pub fn new(count: usize, ones: &'static [(usize, u32)]) -> Self {
         Self { registers: vec![0; count], ones }
     }

@@ -1,4 +1,4 @@
-//! What the bus needs of whoever drives the device: the emulator's own operating system ([`super::CdcDriver`]), or
+//! What the bus needs of the driver of the device: the emulator's own operating system ([`super::CdcDriver`]), or
 //! somebody else's, such as a kernel's behind a socket.
 
 use super::counters::Counters;

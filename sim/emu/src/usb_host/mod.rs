@@ -88,7 +88,7 @@ pub struct UsbHost<D = CdcDriver> {
     frame_at: u64,
     /// Of the frame that starts then.
     frame: u64,
-    /// When the last frame started, until somebody asks.
+    /// When the last frame started, until it is asked for.
     sof: Option<u64>,
     packets_this_frame: u32,
     flight: Option<Flight>,

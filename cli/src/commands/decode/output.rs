@@ -1,0 +1,208 @@
+//! Where decoded frames go, and in which form.
+
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::path::Path;
+
+use anyhow::Context;
+use cantap::{TraceEvent, TraceRecord};
+use cantap_signals::Decoder;
+
+#[cfg(feature = "parquet")]
+use super::columns::{Long, PerMessage, WideFile};
+use super::decoded::Decoded;
+use super::wide::{Csv, Wide};
+use super::{Args, csv, json, text};
+use crate::beside::Beside;
+use crate::trace_output::failed;
+use crate::wrong::wrong;
+
+/// The form that was asked for, by an option or by the file's name.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Form {
+    Text,
+    Json,
+    Csv,
+    #[cfg(feature = "parquet")]
+    Parquet,
+}
+
+impl Form {
+    pub fn of(args: &Args) -> anyhow::Result<Self> {
+        let suffix = args.output.as_deref().and_then(Path::extension).and_then(|suffix| suffix.to_str());
+        let form = match suffix.map(str::to_ascii_lowercase).as_deref() {
+            _ if args.json => Self::Json,
+            _ if args.csv => Self::Csv,
+            #[cfg(feature = "parquet")]
+            _ if args.per_message || !args.partition.is_empty() => {
+                crate::columns::refuse_file(args.output.as_deref().unwrap_or(Path::new("-")))?;
+                Self::Parquet
+            }
+            #[cfg(feature = "parquet")]
+            Some("parquet") => Self::Parquet,
+            Some("csv") => Self::Csv,
+            Some("json" | "jsonl" | "ndjson") => Self::Json,
+            _ => Self::Text,
+        };
+        if matches!(form, Self::Text | Self::Json) && (args.wide || args.resample.is_some()) {
+            return Err(wrong(
+                "--wide and --resample make tables; add --csv, or -o with a name that ends in .csv or .parquet",
+            ));
+        }
+        Ok(form)
+    }
+}
+
+/// Takes decoded frames.
+pub struct Output<'a> {
+    #[cfg_attr(not(feature = "parquet"), expect(dead_code, reason = "only tables ask it"))]
+    decoder: &'a Decoder,
+    to: To,
+}
+
+enum To {
+    Lines {
+        lines: Lines,
+        json: bool,
+        details: bool,
+    },
+    Csv(Lines),
+    Wide(Box<Wide>, WideTo),
+    #[cfg(feature = "parquet")]
+    Long(Box<Long>),
+    #[cfg(feature = "parquet")]
+    PerMessage(Box<PerMessage>),
+}
+
+enum WideTo {
+    Csv(Lines),
+    #[cfg(feature = "parquet")]
+    Parquet(WideFile),
+}
+
+/// Lines for standard output, or for a file that takes its name when it is whole.
+struct Lines {
+    out: BufWriter<Box<dyn Write>>,
+    beside: Option<Beside>,
+    name: String,
+}
+
+impl Lines {
+    fn open(path: Option<&Path>) -> anyhow::Result<Self> {
+        let path = path.unwrap_or(Path::new("-"));
+        let name = failed(path);
+        let beside = Beside::of(path);
+        let out: Box<dyn Write> = if path.as_os_str() == "-" {
+            Box::new(std::io::stdout().lock())
+        } else {
+            let file = beside.as_ref().map_or(path, |beside| &beside.temporary);
+            Box::new(File::create(file).with_context(|| name.clone())?)
+        };
+        Ok(Self { out: BufWriter::with_capacity(1 << 16, out), beside, name })
+    }
+
+    fn finish(mut self) -> anyhow::Result<()> {
+        self.out.flush().with_context(|| self.name.clone())?;
+        drop(self.out);
+        self.beside.map_or(Ok(()), Beside::put_in_place).context(self.name)
+    }
+}
+
+impl<'a> Output<'a> {
+    pub fn open(args: &Args, form: Form, decoder: &'a Decoder) -> anyhow::Result<Self> {
+        let path = args.output.as_deref();
+        let step_ns = args.resample.map(|step| i64::try_from(step.as_nanos()).unwrap_or(i64::MAX));
+        let is_wide = args.wide || step_ns.is_some();
+        let to = match form {
+            Form::Csv if is_wide => To::Wide(Box::new(Wide::new(step_ns)?), WideTo::Csv(Lines::open(path)?)),
+            Form::Csv => {
+                let mut lines = Lines::open(path)?;
+                csv::write_header(&mut lines.out)?;
+                To::Csv(lines)
+            }
+            Form::Text | Form::Json => {
+                To::Lines { lines: Lines::open(path)?, json: form == Form::Json, details: args.details }
+            }
+            #[cfg(feature = "parquet")]
+            Form::Parquet => {
+                let path = path.context("a Parquet file needs a name; give one with -o")?;
+                let failed = || failed(path);
+                if is_wide {
+                    To::Wide(Box::new(Wide::new(step_ns)?), WideTo::Parquet(WideFile::new(path)))
+                } else if args.per_message {
+                    To::PerMessage(Box::new(PerMessage::new(path).with_context(failed)?))
+                } else if args.partition.is_empty() {
+                    To::Long(Box::new(Long::file(path, decoder).with_context(failed)?))
+                } else {
+                    let name = crate::columns::name_of(args.input.as_deref().unwrap_or(Path::new("-")));
+                    To::Long(Box::new(Long::dataset(path, args.partition.clone(), name, decoder)))
+                }
+            }
+        };
+        Ok(Self { decoder, to })
+    }
+
+    /// Takes a frame.
+    pub fn push(&mut self, decoded: &Decoded) -> anyhow::Result<()> {
+        match &mut self.to {
+            To::Lines { lines, json: true, details } => json::write(&mut lines.out, decoded, *details)?,
+            To::Lines { lines, .. } => text::write(&mut lines.out, decoded)?,
+            To::Csv(lines) => csv::write(&mut lines.out, decoded)?,
+            To::Wide(wide, _) => wide.push(decoded)?,
+            #[cfg(feature = "parquet")]
+            To::Long(long) => long.push(self.decoder, decoded)?,
+            #[cfg(feature = "parquet")]
+            To::PerMessage(files) => files.push(decoded)?,
+        }
+        Ok(())
+    }
+
+    /// Takes what happened beside frames. Lines do not have it; the summary counts losses.
+    pub fn push_event(&mut self, record: &TraceRecord) -> anyhow::Result<()> {
+        match &mut self.to {
+            To::Wide(wide, _) if matches!(record.event, TraceEvent::Lost { .. }) => {
+                wide.interrupt(record.channel);
+            }
+            #[cfg(feature = "parquet")]
+            To::Long(long) => long.push_event(record)?,
+            #[cfg(feature = "parquet")]
+            To::PerMessage(files) => files.push_event(record)?,
+            _ => {}
+        }
+        Ok(())
+    }
+
+    /// Gives out what waits, where somebody may read along.
+    pub fn flush(&mut self) -> anyhow::Result<()> {
+        match &mut self.to {
+            To::Lines { lines, .. } | To::Csv(lines) => Ok(lines.out.flush()?),
+            _ => Ok(()),
+        }
+    }
+
+    /// Ends the output and puts it in its place; behind JSON lines comes the summary.
+    pub fn finish(self, summary: &serde_json::Value) -> anyhow::Result<()> {
+        match self.to {
+            To::Lines { mut lines, json, .. } => {
+                if json {
+                    writeln!(lines.out, "{}", serde_json::json!({ "summary": summary }))?;
+                }
+                lines.finish()
+            }
+            To::Csv(lines) => lines.finish(),
+            To::Wide(wide, WideTo::Csv(mut lines)) => {
+                wide.finish(&mut Csv(&mut lines.out))?;
+                lines.finish()
+            }
+            #[cfg(feature = "parquet")]
+            To::Wide(wide, WideTo::Parquet(mut file)) => {
+                wide.finish(&mut file)?;
+                Ok(file.finish()?)
+            }
+            #[cfg(feature = "parquet")]
+            To::Long(long) => Ok(long.finish()?),
+            #[cfg(feature = "parquet")]
+            To::PerMessage(files) => Ok(files.finish()?),
+        }
+    }
+}

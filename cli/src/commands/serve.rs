@@ -1,0 +1,340 @@
+//! `cantap serve`: a device for many programs at once, on this machine or on others.
+
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{Ipv4Addr, SocketAddr};
+#[cfg(unix)]
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use cantap::device::{channel_number, pipe, write_patiently};
+use cantap::wire::CHANNELS;
+use cantap::{Channel, DeviceError};
+use cantap_serve::listen::{self, Listening};
+use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
+
+use crate::address::Address;
+use crate::args::Channels;
+use crate::boards::Boards;
+use crate::channel_bitrate::ChannelBitrate;
+use crate::server::{PORT, role};
+use crate::timing_args::TimingArgs;
+use crate::wrong::wrong;
+use crate::{interrupt, stderr};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in every command. A \
+                  second device is\nat the same path with -2 behind its name, and at the next port.\n\n\
+                  Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
+                  Examples:\n  cantap serve -d /dev/ttyACM0 -b 500k\n  \
+                  cantap capture -d unix: -o drive.log\n  \
+                  cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
+                  cantap monitor -d tcp://127.0.0.1\n  \
+                  cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log"
+)]
+pub struct Args {
+    /// Where the device is: a serial port, or virtual. Repeat for several. Without it, the board that is connected.
+    #[arg(short, long = "device", value_name = "DEVICE")]
+    devices: Vec<Address>,
+    /// Bit rate of the buses in bit/s: 500000, 500k, 1M; with a channel before it (2:250k), that channel's only. Can be repeated.
+    /// Without it, the one saved on the device.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE")]
+    bitrates: Vec<ChannelBitrate>,
+    /// The most that a client may do: listen; configure, which is to choose bit rates and to store settings, one client at a time;
+    /// send, which includes acknowledging.
+    #[arg(long, value_name = "ROLE", value_parser = role, default_value = "listen")]
+    allow: Role,
+    /// Listen on a UNIX socket, which is this user's alone; the default, at a path of the user's own.
+    #[cfg(unix)]
+    #[arg(long, value_name = "PATH")]
+    unix: Option<PathBuf>,
+    /// Listen on a TCP port of this computer, which all its users can reach; 127.0.0.1:29537 unless given.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    tcp: Option<String>,
+    /// Speak the socketcand protocol, for SavvyCAN, Kayak and python-can; at 127.0.0.1:29536 unless given. At an address that other
+    /// computers reach, clients may only listen: the protocol does not ask who they are.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    socketcand: Option<String>,
+    /// Write candump's log lines to whoever connects, for nc and SavvyCAN's log server; at 127.0.0.1:29538 unless given.
+    #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
+    lines: Option<String>,
+    /// Serve one client through standard input and output, as ssh starts it.
+    #[arg(long)]
+    stdio: bool,
+}
+
+/// How often to check whether to end.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+/// The port of `--lines`, unless another is given.
+const LINES_PORT: u16 = 29_538;
+/// Bytes of standard input that wait at most.
+const STDIN_BYTES: usize = 16 * 1024;
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let addresses = Boards::new(&args.devices, &Channels::all())?;
+    let addresses = addresses.addresses();
+    if args.stdio && addresses.len() > 1 {
+        return Err(wrong("--stdio serves one device; leave the others away"));
+    }
+    let mut timing = TimingArgs::default();
+    timing.set_bit_rates(args.bitrates.clone());
+    timing.check_channels(addresses.len())?;
+    let tcp = args.tcp.as_deref().map(|text| loopback(text, PORT)).transpose()?;
+    let beside = Beside {
+        socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
+        lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
+    };
+    // From here on Ctrl-C ends it in order.
+    interrupt::watch()?;
+    let mut boards = Vec::new();
+    for (number, address) in addresses.iter().enumerate() {
+        let board = start(args, number, address)?;
+        check_bitrates(args, number, &board)?;
+        boards.push(Arc::new(board));
+    }
+    if args.stdio {
+        return serve_stdio(&boards[0], args.allow);
+    }
+    let listening = listen(args, tcp, &beside, &boards)?;
+    while !interrupt::requested() {
+        std::thread::sleep(LOOK_EVERY);
+    }
+    drop(listening);
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Takes a device, which must be there.
+fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board> {
+    let of_buses = address.bitrates_of_buses();
+    let bitrates_bps: [Option<u32>; CHANNELS] = Channel::ALL.map(|channel| {
+        ChannelBitrate::of(&args.bitrates, channel_number(number, channel)).or(of_buses[channel.index()])
+    });
+    let settings = Settings { bitrates_bps, ..Settings::default() };
+    let at = address.clone();
+    let connect = Box::new(move |serial: Option<&str>| {
+        at.link(serial).map_err(|error| match error.downcast::<DeviceError>() {
+            Ok(error) => error.into(),
+            Err(error) => error.into(),
+        })
+    });
+    Board::start(&address.to_string(), connect, settings, tell).map_err(|error| match error {
+        BoardError::Device(error) => error.into(),
+        BoardError::Connect(error) => anyhow::anyhow!(error),
+    })
+}
+
+/// Who comes and goes is told to whoever runs it; what must not be overlooked, so that it is not.
+fn tell(news: News) {
+    match news {
+        News::BoardLost { .. } | News::Refused { .. } => stderr::warn(&news.to_string()),
+        news => eprintln!("cantap: {news}"),
+    }
+}
+
+/// Where nobody may choose a bit rate there has to be one.
+fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<()> {
+    if args.allow >= Role::Configure {
+        return Ok(());
+    }
+    let rates = board.bitrates_bps();
+    let unknown: Vec<String> = Channel::ALL
+        .into_iter()
+        .filter(|channel| rates[channel.index()].is_none())
+        .map(|channel| channel_number(number, channel).to_string())
+        .collect();
+    let advice = "give it with -b, or let clients choose it with --allow configure";
+    match unknown.as_slice() {
+        [] => Ok(()),
+        [one] => {
+            eprintln!(
+                "cantap: the bit rate of channel {one} is not known, so nobody can listen to it: {advice}"
+            );
+            Ok(())
+        }
+        _ => bail!("no bit rate is known for '{}': {advice}", board.name()),
+    }
+}
+
+/// An address, a port of this computer, or both.
+fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
+    let not_one = || wrong(format!("'{text}' is no address to listen at; write it as 127.0.0.1:{port}"));
+    let address: SocketAddr = match text.parse() {
+        Ok(address) => address,
+        Err(_) => match (text.parse(), text.parse()) {
+            (Ok(ip), _) => SocketAddr::new(ip, port),
+            (_, Ok(port)) => SocketAddr::from((Ipv4Addr::LOCALHOST, port)),
+            _ => return Err(not_one()),
+        },
+    };
+    if address.ip().is_unspecified() {
+        return Err(wrong(format!(
+            "at {address} everybody on every network could use the device; name one address of this computer"
+        )));
+    }
+    Ok(address)
+}
+
+/// An address that only this computer reaches.
+fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
+    let address = address(text, port)?;
+    if !address.ip().is_loopback() {
+        return Err(wrong(format!(
+            "at {address} everybody on the network could use the device; listen at 127.0.0.1 and let clients come by ssh \
+             (-d ssh://HOST/…)"
+        )));
+    }
+    Ok(address)
+}
+
+/// Opens every way in and prints it.
+fn listen(
+    args: &Args,
+    tcp: Option<SocketAddr>,
+    beside: &Beside,
+    boards: &[Arc<Board>],
+) -> anyhow::Result<Vec<Listening>> {
+    let mut ways = Vec::new();
+    let mut said = Vec::new();
+    for (number, board) in boards.iter().enumerate() {
+        let mut names = Vec::new();
+        #[cfg(unix)]
+        if tcp.is_none() || args.unix.is_some() {
+            let path = numbered(&args.unix.clone().unwrap_or_else(connect::default_socket), number);
+            let way = listen::unix(board, &path, args.allow).map_err(|error| match error.kind() {
+                ErrorKind::AddrInUse => anyhow::anyhow!(
+                    "another server is at '{}' already; end it, or give another path with --unix",
+                    path.display()
+                ),
+                _ => anyhow::anyhow!(
+                    "no socket can be made at '{}': {error}; give another path with --unix",
+                    path.display()
+                ),
+            })?;
+            names.push(format!("unix:{}", path.display()));
+            ways.push(way);
+        }
+        #[cfg(not(unix))]
+        let tcp = Some(tcp.unwrap_or(SocketAddr::from((Ipv4Addr::LOCALHOST, PORT))));
+        if let Some(first) = tcp {
+            let port = match first.port() {
+                0 => 0,
+                port => port + number as u16,
+            };
+            let address = SocketAddr::new(first.ip(), port);
+            let way = listen::tcp(board, address, args.allow)
+                .with_context(|| format!("nobody can listen at {address}; give another port with --tcp"))?;
+            names.push(format!("tcp://{}", way.address().unwrap_or(address)));
+            ways.push(way);
+        }
+        said.push((board.name(), names));
+    }
+    let other = beside.listen(args.allow, boards)?;
+    let mut out = io::stdout().lock();
+    for (_, names) in &said {
+        for name in names {
+            writeln!(out, "{name}")?;
+        }
+    }
+    for (name, way) in other {
+        writeln!(out, "{name}")?;
+        ways.push(way);
+    }
+    out.flush()?;
+    for (board, names) in &said {
+        eprintln!(
+            "cantap: '{board}' is shared at {}; clients may {}; Ctrl-C ends it",
+            names.join(" and "),
+            args.allow
+        );
+    }
+    Ok(ways)
+}
+
+/// Other programs' ways in, each to all boards.
+struct Beside {
+    socketcand: Option<SocketAddr>,
+    lines: Option<SocketAddr>,
+}
+
+impl Beside {
+    /// Opens them. Returns what each is called.
+    fn listen(&self, role: Role, boards: &[Arc<Board>]) -> anyhow::Result<Vec<(String, Listening)>> {
+        let mut ways = Vec::new();
+        if let Some(address) = self.socketcand {
+            let way = socketcand::listen(boards, address, role).with_context(|| {
+                format!("nobody can listen at {address}; give another port with --socketcand")
+            })?;
+            let address = way.address().unwrap_or(address);
+            if !address.ip().is_loopback() {
+                stderr::warn(&format!("whoever reaches {address} can hear the buses; nobody can send there"));
+            }
+            ways.push((format!("can://{address}"), way));
+        }
+        if let Some(address) = self.lines {
+            let way = lines::listen(boards, address)
+                .with_context(|| format!("nobody can listen at {address}; give another port with --lines"))?;
+            ways.push((format!("lines at {}", way.address().unwrap_or(address)), way));
+        }
+        Ok(ways)
+    }
+}
+
+/// The path of a further device.
+#[cfg(unix)]
+fn numbered(path: &Path, number: usize) -> PathBuf {
+    if number == 0 {
+        return path.to_owned();
+    }
+    let stem = path.file_stem().unwrap_or_default().to_string_lossy();
+    let suffix = path.extension().map_or_else(String::new, |suffix| format!(".{}", suffix.to_string_lossy()));
+    path.with_file_name(format!("{stem}-{}{suffix}", number + 1))
+}
+
+/// Serves whoever is at the other end of standard input and output until that is closed.
+fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
+    let (input, mut to_input) = pipe(STDIN_BYTES);
+    // Standard input can be waited for only without a limit.
+    std::thread::Builder::new().name("cantap-stdin".to_owned()).spawn(move || {
+        let mut bytes = [0; 4096];
+        let mut stdin = io::stdin().lock();
+        while let Ok(len @ 1..) = stdin.read(&mut bytes) {
+            if write_patiently(&mut to_input, &bytes[..len], Duration::MAX).is_err() {
+                return;
+            }
+        }
+    })?;
+    board.admit(input, io::stdout(), "the client", role)?;
+    while board.clients() > 0 && !interrupt::requested() {
+        std::thread::sleep(LOOK_EVERY);
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_addresses_of_this_computer_are_listened_at() {
+        let at = |text: &str| loopback(text, PORT).map(|address| address.to_string());
+        assert_eq!(at("127.0.0.1").unwrap(), format!("127.0.0.1:{PORT}"));
+        assert_eq!(at("5000").unwrap(), "127.0.0.1:5000");
+        assert_eq!(at("[::1]:5000").unwrap(), "[::1]:5000");
+        for wrong in ["0.0.0.0", "192.168.0.1:5000", "[::]:1", "car", ""] {
+            assert!(loopback(wrong, PORT).is_err(), "{wrong}");
+        }
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_further_device_has_a_number_in_its_path() {
+        assert_eq!(numbered(Path::new("/run/cantap.sock"), 0), Path::new("/run/cantap.sock"));
+        assert_eq!(numbered(Path::new("/run/cantap.sock"), 1), Path::new("/run/cantap-2.sock"));
+        assert_eq!(numbered(Path::new("x"), 2), Path::new("x-3"));
+    }
+}

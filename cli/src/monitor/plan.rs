@@ -1,0 +1,96 @@
+//! Which devices the live view watches, and how it takes part in their buses.
+
+use cantap::Channel;
+use cantap::device::channel_number;
+use cantap::wire::CHANNELS;
+use cantap::wire::message::Mode;
+
+use crate::address::Address;
+use crate::channel_args::ChannelArgs;
+use crate::channel_bitrate::ChannelBitrate;
+
+/// Which devices, and how to take part in their buses.
+#[derive(Clone, Debug)]
+pub struct Plan {
+    /// The devices. The second one's channels are 3 and 4, and so on.
+    pub addresses: Vec<Address>,
+    /// Channels to open, by number.
+    pub channels: Vec<u8>,
+    /// How to open them, as on the command line; only listening where it does not say.
+    pub open: ChannelArgs,
+}
+
+impl Plan {
+    /// Only listening to devices, on the channels whose bit rates are known; on all if none is.
+    pub fn listening(addresses: Vec<Address>, options: &cantap_analysis::stats::Options) -> Self {
+        let mut plan = Self { addresses, channels: Vec::new(), open: ChannelArgs::default() };
+        for channel in plan.all_channels() {
+            let rate = options.bitrate_of(channel);
+            let rates = rate.map(|bitrate_bps| ChannelBitrate { channel: Some(channel), bitrate_bps });
+            plan.open.timing.bitrates.extend(rates);
+        }
+        plan.choose_channels();
+        plan
+    }
+
+    /// The same with other devices. With more or fewer of them, it has other channels, too.
+    pub fn at(&self, addresses: Vec<Address>) -> Self {
+        let is_as_many = addresses.len() == self.addresses.len();
+        let mut plan = Self { addresses, ..self.clone() };
+        if !is_as_many {
+            plan.choose_channels();
+        }
+        plan
+    }
+
+    /// What messages call the devices.
+    pub fn name(&self) -> String {
+        let names: Vec<String> = self.addresses.iter().map(ToString::to_string).collect();
+        names.join(" + ")
+    }
+
+    /// The channels of a device, from 0, that are to be opened.
+    pub fn channels_of(&self, board: usize) -> impl Iterator<Item = Channel> + use<'_> {
+        Channel::ALL
+            .into_iter()
+            .filter(move |channel| self.channels.contains(&channel_number(board, *channel)))
+    }
+
+    /// The numbers of all channels that the devices have.
+    fn all_channels(&self) -> std::ops::RangeInclusive<u8> {
+        1..=(self.addresses.len() * CHANNELS) as u8
+    }
+
+    /// How it takes part in the buses.
+    pub fn mode(&self) -> Mode {
+        self.open.mode().unwrap_or(Mode::ListenOnly)
+    }
+
+    /// Other bit rates, in place of whatever timing there was. A rate that is for one channel alone opens that channel alone.
+    pub fn set_bit_rates(&mut self, rates: Vec<ChannelBitrate>) {
+        self.open.timing.set_bit_rates(rates);
+        self.choose_channels();
+    }
+
+    /// The channels that bit rates speak of; all if there are none.
+    pub fn choose_channels(&mut self) {
+        let rates = &self.open.timing.bitrates;
+        self.channels = self
+            .all_channels()
+            .filter(|channel| rates.is_empty() || ChannelBitrate::of(rates, *channel).is_some())
+            .collect();
+    }
+
+    /// The statistics' options with this plan's bit rates, as far as it has any.
+    pub fn options(&self, others: &cantap_analysis::stats::Options) -> cantap_analysis::stats::Options {
+        let rates = self.channels.iter().copied().filter_map(|number| {
+            let own = ChannelBitrate::of(&self.open.timing.bitrates, number);
+            Some((number, own.or_else(|| others.bitrate_of(number))?))
+        });
+        cantap_analysis::stats::Options {
+            bitrate_bps: None,
+            channel_bitrate_bps: rates.collect(),
+            ..others.clone()
+        }
+    }
+}

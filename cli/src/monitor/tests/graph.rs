@@ -1,0 +1,202 @@
+//! The graph shows what was sampled, at any length of time, and its cursors tell it.
+
+use cantap::{TraceEvent, TraceRecord};
+use cantap_analysis::stats::Options;
+use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
+
+use super::super::app::{App, View};
+use super::super::model::Model;
+use super::{app, database, frame, press, screen_text};
+
+const MS: i64 = 1_000_000;
+const S: i64 = 1000 * MS;
+/// 12:00:00 of a day.
+const NOON: i64 = (20_000 * 86_400 + 43_200) * S;
+
+const SIGNALS: &str = r#"
+    version = 1
+    [[message]]
+    name = "Engine"
+    id = 0x123
+    length = 2
+    [[message.signal]]
+    name = "Speed"
+    at = "D1"
+    unit = "rpm"
+    [[message.signal]]
+    name = "Brake"
+    at = "D2"
+    digital = { low = 0, high = 1 }
+"#;
+
+fn model(history_bytes: usize) -> Model {
+    let mut model = Model::new(database(SIGNALS), Options::default(), history_bytes).unwrap();
+    model.seen.signals.choose("Speed").unwrap();
+    model
+}
+
+fn sample(at_ns: i64, speed: u8, brake: u8) -> TraceRecord {
+    TraceRecord { time_ns: NOON + at_ns, channel: 1, event: frame(&format!("123#{speed:02X}{brake:02X}")) }
+}
+
+fn keys(app: &mut App, model: &mut Model, codes: &[KeyCode]) {
+    for code in codes {
+        app.key(KeyEvent::from(*code), model);
+        screen_text(app, model, (100, 24)).unwrap();
+    }
+}
+
+fn mouse(app: &mut App, model: &mut Model, kind: MouseEventKind, column: u16) -> String {
+    app.mouse(MouseEvent { kind, column, row: 5, modifiers: KeyModifiers::NONE }, model);
+    screen_text(app, model, (100, 24)).unwrap()
+}
+
+/// Rows of the pane that have something in them, besides the values at the left.
+fn drawn_rows(screen: &str) -> usize {
+    let pane = screen.lines().skip(3).take(18);
+    pane.filter(|line| line.chars().skip(10).any(|character| character != ' ')).count()
+}
+
+#[test]
+fn one_value_of_a_millisecond_among_an_hour_of_others_is_seen_and_found() {
+    let mut model = model(64_000_000);
+    // Ten a second for an hour, and one in between.
+    let mut records: Vec<_> = (0..36_000).map(|n| sample(n * 100 * MS, 10, 0)).collect();
+    records.insert(18_001, sample(1_800_000 * MS + MS, 200, 0));
+    records.insert(18_002, sample(1_800_000 * MS + 2 * MS, 10, 0));
+    model.take(&records);
+    let (mut app, _orders) = app(View::Graph);
+    // The last ten seconds: nothing but a straight line.
+    let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
+    assert_eq!(drawn_rows(&screen), 1, "{screen}");
+    // Everything: the one value stands out.
+    press(&mut app, &mut model, "a");
+    let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
+    assert!(drawn_rows(&screen) > 14 && screen.contains("200┤"), "{screen}");
+    assert!(screen.contains("╵12:15:00") && screen.contains("╵12:30:00"), "{screen}");
+    // Going there with the wheel, column by column: at last it is a millisecond wide.
+    let column = |screen: &str| {
+        let line: Vec<char> = screen.lines().nth(6).unwrap().chars().collect();
+        (11..line.len()).find(|at| line[*at] != ' ').map(|at| at as u16)
+    };
+    let mut screen = screen;
+    for _ in 0..18 {
+        let at = column(&screen).unwrap_or_else(|| panic!("it is gone: {screen}"));
+        screen = mouse(&mut app, &mut model, MouseEventKind::ScrollUp, at);
+    }
+    assert!(app.graph.span_ns < 20 * MS && screen.contains("NOT FOLLOWING"), "{screen}");
+    assert!(drawn_rows(&screen) > 14, "{screen}");
+}
+
+#[test]
+fn two_cursors_tell_times_values_and_what_is_between() {
+    let mut model = model(1_000_000);
+    model.take(&(0..=100).map(|n| sample(n * 100 * MS, n as u8, 0)).collect::<Vec<_>>());
+    let (mut app, _orders) = app(View::Graph);
+    screen_text(&mut app, &model, (100, 24)).unwrap();
+    // Ninety columns for ten seconds: the tenth's middle is at 1.055 s.
+    mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Left), 19);
+    mouse(&mut app, &mut model, MouseEventKind::Down(MouseButton::Right), 30);
+    let screen = mouse(&mut app, &mut model, MouseEventKind::Drag(MouseButton::Right), 55);
+    assert!(screen.contains("Speed A 10 B 50 Δ 40"), "{screen}");
+    assert!(screen.contains("A 12:00:01.055555  B 12:00:05.055555  Δt 4.000000 s"), "{screen}");
+    // Keys move the one that was set last, a column at a time, then the other.
+    keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::Char('x'), KeyCode::Right, KeyCode::Right]);
+    let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
+    assert!(screen.contains("Δt 3.666666 s") || screen.contains("Δt 3.666667 s"), "{screen}");
+    keys(&mut app, &mut model, &[KeyCode::Esc]);
+    assert!(!screen_text(&mut app, &model, (100, 24)).unwrap().contains("Δt"));
+    assert_eq!(app.graph.end_ns, None);
+}
+
+#[test]
+fn a_value_is_held_until_the_next_or_led_there_by_a_line() {
+    let mut model = model(1_000_000);
+    model.take(&[sample(0, 0, 0), sample(8 * S, 100, 0), sample(10 * S, 100, 0)]);
+    let (mut app, _orders) = app(View::Graph);
+    let middle = |screen: &str| screen.lines().nth(11).unwrap().chars().nth(50);
+    let steps = screen_text(&mut app, &model, (100, 24)).unwrap();
+    press(&mut app, &mut model, "s");
+    let lines = screen_text(&mut app, &model, (100, 24)).unwrap();
+    assert_eq!(middle(&steps), Some(' '), "{steps}");
+    assert_ne!(middle(&lines), Some(' '), "{lines}");
+    assert!(steps.contains("10 s, steps") && lines.contains("10 s, lines"));
+    // Between the values, where none is in sight, the one before is held.
+    press(&mut app, &mut model, "s");
+    app.graph.span_ns = S;
+    app.graph.end_ns = Some(NOON + 5 * S);
+    let held = screen_text(&mut app, &model, (100, 24)).unwrap();
+    assert_eq!(drawn_rows(&held), 1, "{held}");
+}
+
+#[test]
+fn nothing_is_drawn_across_a_loss_nor_after_the_last_value() {
+    let mut model = model(1_000_000);
+    let lost = TraceEvent::Lost { stage: None, count: 3, at_least: false };
+    model.take(&[
+        sample(0, 50, 1),
+        sample(2 * S, 50, 1),
+        TraceRecord { time_ns: NOON + 3 * S, channel: 1, event: lost },
+        sample(6 * S, 50, 1),
+        sample(7 * S, 50, 1),
+        TraceRecord { time_ns: NOON + 10 * S, channel: 1, event: frame("7FF#") },
+    ]);
+    let (mut app, _orders) = app(View::Graph);
+    let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
+    let line: Vec<char> = screen
+        .lines()
+        .skip(3)
+        .find(|line| line.chars().skip(12).any(|c| c != ' '))
+        .unwrap()
+        .chars()
+        .collect();
+    let is_drawn = |second: usize| line.get(10 + second * 9 + 4).is_some_and(|character| *character != ' ');
+    let drawn: Vec<_> = (0..10).filter(|second| is_drawn(*second)).collect();
+    assert_eq!(drawn, [0, 1, 6], "{screen}");
+}
+
+#[test]
+fn a_signal_that_is_chosen_late_has_its_past_and_what_fell_out_is_told() {
+    let mut model = model(1_000_000);
+    model.take(
+        &(0..20_000).map(|n| sample(n * MS, (n / 100) as u8, (n / 1000 % 2) as u8)).collect::<Vec<_>>(),
+    );
+    let (mut app, _orders) = app(View::Signals);
+    screen_text(&mut app, &model, (100, 24)).unwrap();
+    keys(&mut app, &mut model, &[KeyCode::Down, KeyCode::Enter]);
+    press(&mut app, &mut model, "4");
+    let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
+    let lane = screen.lines().find(|line| line.contains('▔')).unwrap();
+    let (high, low) = (lane.matches('▔').count(), lane.matches('▁').count());
+    assert!((40..50).contains(&high) && (40..50).contains(&low), "{screen}");
+    assert!(!screen.contains("nothing is kept"), "{screen}");
+    // Within a memory of its own, which is told, the oldest makes room.
+    model.take(&(20_000..200_000).map(|n| sample(n * MS, 1, 0)).collect::<Vec<_>>());
+    let (values, used, most) = model.seen.signals.graph_memory();
+    assert!(used <= most && most == 1_000_000 && values > 50_000, "{values} {used} {most}");
+    press(&mut app, &mut model, "a-");
+    let screen = screen_text(&mut app, &model, (140, 24)).unwrap();
+    assert!(screen.contains("before 12:02:4") && screen.contains("nothing is kept (--history)"), "{screen}");
+    // Out of the graph, its memory is free again.
+    press(&mut app, &mut model, "3");
+    screen_text(&mut app, &model, (100, 24)).unwrap();
+    keys(&mut app, &mut model, &[KeyCode::Enter]);
+    assert!(model.seen.signals.graph_memory().1 <= used / 2 + 10_000);
+}
+
+#[test]
+fn the_window_pans_back_and_follows_again() {
+    let mut model = model(1_000_000);
+    model.take(&(0..600).map(|n| sample(n * 100 * MS, n as u8, 0)).collect::<Vec<_>>());
+    let (mut app, _orders) = app(View::Graph);
+    screen_text(&mut app, &model, (100, 24)).unwrap();
+    keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::PageUp]);
+    assert_eq!(app.graph.end_ns, Some(NOON + 59_900 * MS - 6 * S));
+    assert!(screen_text(&mut app, &model, (100, 24)).unwrap().contains("  NOT FOLLOWING"));
+    keys(&mut app, &mut model, &[KeyCode::Home]);
+    assert_eq!(app.graph.end_ns, Some(NOON + 10 * S));
+    keys(&mut app, &mut model, &[KeyCode::PageDown; 12]);
+    assert_eq!(app.graph.end_ns, None);
+    keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::End]);
+    assert_eq!(app.graph.end_ns, None);
+}

@@ -1,0 +1,205 @@
+//! Where a server is that shares a board: `unix:PATH`, `tcp://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
+
+use std::io::ErrorKind;
+#[cfg(unix)]
+use std::path::PathBuf;
+use std::process::Command;
+
+use anyhow::Context;
+use cantap::device::Link;
+use cantap_serve::{Role, connect};
+
+/// The port of `cantap serve --tcp`, unless another is given.
+pub const PORT: u16 = 29_537;
+
+/// A server.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Server {
+    /// On this machine, for this user.
+    #[cfg(unix)]
+    Unix(PathBuf),
+    /// At `HOST:PORT`.
+    Tcp(String),
+    /// Started for this client on another computer.
+    Ssh(Ssh),
+}
+
+/// What is started through ssh.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Ssh {
+    /// As ssh takes it, with the user if one was given.
+    host: String,
+    /// Without one, the board that is connected there.
+    device: Option<String>,
+    /// What this client may do.
+    allow: Role,
+}
+
+/// How servers' addresses begin.
+const SCHEMES: [&str; 3] = ["unix:", "tcp:", "ssh:"];
+
+impl Server {
+    /// Whether a text is meant for a server.
+    pub fn is_meant(text: &str) -> bool {
+        SCHEMES.iter().any(|scheme| text.starts_with(scheme))
+    }
+
+    /// Reads such a text. An error says what would be right.
+    pub fn parse(text: &str) -> Result<Self, String> {
+        if let Some(path) = text.strip_prefix("unix:") {
+            #[cfg(unix)]
+            return Ok(Self::Unix(match path {
+                "" => connect::default_socket(),
+                path => PathBuf::from(path),
+            }));
+            #[cfg(not(unix))]
+            return Err(format!("this system has no UNIX sockets for '{path}'; use tcp://127.0.0.1"));
+        }
+        if let Some(place) = text.strip_prefix("tcp://").filter(|place| !place.is_empty()) {
+            return with_port(place).map(Self::Tcp);
+        }
+        match text.strip_prefix("ssh://") {
+            Some(place) if !place.is_empty() => Ssh::parse(place).map(Self::Ssh),
+            _ => Err("write it as unix:PATH, tcp://HOST:PORT or ssh://[USER@]HOST[/DEVICE]".to_owned()),
+        }
+    }
+
+    /// Connects to it.
+    pub fn link(&self) -> anyhow::Result<Link> {
+        let (name, linked) = match self {
+            #[cfg(unix)]
+            Self::Unix(path) => (path.display().to_string(), connect::unix(path)),
+            Self::Tcp(address) => (address.clone(), connect::tcp(address)),
+            Self::Ssh(ssh) => {
+                let mut command = ssh.command();
+                let program = command.get_program().to_string_lossy().into_owned();
+                return connect::program(&mut command).with_context(|| {
+                    format!("'{program}' does not start; install it, or name another in CANTAP_SSH")
+                });
+            }
+        };
+        linked.map_err(|error| {
+            let advice = match error.kind() {
+                ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
+                    "there is no server; start one with `cantap serve`"
+                }
+                ErrorKind::PermissionDenied => {
+                    "it belongs to another user of this computer, who alone can use it"
+                }
+                _ => "it cannot be reached",
+            };
+            anyhow::anyhow!("'{name}': {advice} ({error})")
+        })
+    }
+}
+
+/// The port that goes without saying.
+fn with_port(place: &str) -> Result<String, String> {
+    let has_port = |rest: &str| rest.rsplit_once(':').is_some_and(|(_, port)| port.parse::<u16>().is_ok());
+    let host_only = match place.strip_prefix('[') {
+        Some(rest) => match rest.split_once(']') {
+            Some((_, "")) => true,
+            Some((_, rest)) if has_port(rest) => false,
+            _ => return Err(format!("'{place}' is no address; write it as [::1]:{PORT}")),
+        },
+        None if place.matches(':').count() > 1 => {
+            return Err(format!("'{place}' is no address; an IPv6 one stands in brackets, as [::1]:{PORT}"));
+        }
+        None if place.contains(':') && !has_port(place) => {
+            return Err(format!("'{place}' has no port number behind its colon; write it as HOST:{PORT}"));
+        }
+        None => !place.contains(':'),
+    };
+    Ok(if host_only { format!("{place}:{PORT}") } else { place.to_owned() })
+}
+
+impl Ssh {
+    fn parse(place: &str) -> Result<Self, String> {
+        let (place, allow) = match place.rsplit_once("?allow=") {
+            Some((place, allow)) => (place, role(allow)?),
+            // Nobody else uses the board meanwhile.
+            None => (place, Role::Configure),
+        };
+        let (host, device) = match place.split_once('/') {
+            Some((host, "")) => (host, None),
+            // A port of that computer, whether its first slash was doubled or not.
+            Some((host, device)) if device.starts_with("dev/") => (host, Some(format!("/{device}"))),
+            Some((host, device)) => (host, Some(device.to_owned())),
+            None => (place, None),
+        };
+        let name = host.rsplit_once('@').map_or(host, |(_, name)| name);
+        // What begins with a dash would be an option of ssh.
+        if name.is_empty() || name.starts_with('-') || host.starts_with(['-', '@']) {
+            return Err(format!("'{host}' is no name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"));
+        }
+        Ok(Self { host: host.to_owned(), device, allow })
+    }
+
+    /// ssh, or the program named by `CANTAP_SSH`.
+    fn command(&self) -> Command {
+        let program = std::env::var_os("CANTAP_SSH").unwrap_or_else(|| "ssh".into());
+        let mut command = Command::new(program);
+        // It is no part of the terminal's foreground, so that Ctrl-C does not end it before the capture: it cannot ask for anything.
+        command.args(["-T", "-oBatchMode=yes", "--", &self.host]);
+        command.args(["cantap", "serve", "--stdio", "--allow", self.allow.name()]);
+        if let Some(device) = &self.device {
+            command.args(["-d", &quoted(device)]);
+        }
+        #[cfg(unix)]
+        std::os::unix::process::CommandExt::process_group(&mut command, 0);
+        command
+    }
+}
+
+/// For the shell of the other computer, which ssh hands everything to.
+fn quoted(text: &str) -> String {
+    format!("'{}'", text.replace('\'', r"'\''"))
+}
+
+/// A role as it is typed.
+pub fn role(text: &str) -> Result<Role, String> {
+    let found = Role::ALL.into_iter().find(|role| role.name() == text);
+    found.ok_or_else(|| "clients may listen, configure or send".to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn addresses_of_servers_name_a_socket_a_port_or_a_computer() {
+        let parse = |text: &str| Server::parse(text);
+        assert_eq!(parse("tcp://car"), Ok(Server::Tcp(format!("car:{PORT}"))));
+        assert_eq!(parse("tcp://car:5"), Ok(Server::Tcp("car:5".to_owned())));
+        assert_eq!(parse("tcp://[::1]"), Ok(Server::Tcp(format!("[::1]:{PORT}"))));
+        assert_eq!(parse("tcp://[::1]:5"), Ok(Server::Tcp("[::1]:5".to_owned())));
+        #[cfg(unix)]
+        assert_eq!(parse("unix:/run/a"), Ok(Server::Unix("/run/a".into())));
+        for wrong in
+            ["tcp:car", "tcp://", "tcp://::1", "tcp://car:x", "ssh:car", "ssh://", "ssh://-oProxyCommand=x"]
+        {
+            assert!(parse(wrong).is_err(), "{wrong}");
+        }
+    }
+
+    /// What the other computer's shell is given is one word, whatever is in it.
+    #[test]
+    fn ssh_is_given_the_device_as_one_word_and_no_option() {
+        let command = |text: &str| {
+            let Ok(Server::Ssh(ssh)) = Server::parse(text) else { panic!("{text}") };
+            ssh.command().get_args().skip(3).map(|arg| arg.to_string_lossy().into_owned()).collect::<Vec<_>>()
+        };
+        let start = |host: &str, allow: &str| {
+            [host, "cantap", "serve", "--stdio", "--allow", allow].map(str::to_owned).to_vec()
+        };
+        assert_eq!(command("ssh://me@car"), start("me@car", "configure"));
+        for device in ["ssh://car/dev/ttyACM0", "ssh://car//dev/ttyACM0"] {
+            assert_eq!(command(device)[6..], ["-d", "'/dev/ttyACM0'"]);
+        }
+        assert_eq!(command("ssh://car/virtual:car?allow=send")[..6], start("car", "send"));
+        assert_eq!(command("ssh://car/x'; reboot '")[7], r"'x'\''; reboot '\'''");
+        for wrong in ["ssh://-l/x", "ssh://a@-l", "ssh://@b", "ssh:///x", "ssh://a?allow=all"] {
+            assert!(Server::parse(wrong).is_err(), "{wrong}");
+        }
+    }
+}

@@ -1,0 +1,298 @@
+//! `cantap serve`, and commands on the other side of it: on a UNIX socket, over TCP, through ssh.
+#![cfg(unix)]
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::TcpStream;
+use std::os::unix::fs::PermissionsExt;
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Output, Stdio};
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+const CANTAP: &str = env!("CARGO_BIN_EXE_cantap");
+
+fn cantap(arguments: &str) -> Command {
+    let mut command = Command::new(CANTAP);
+    command
+        .args(arguments.split_whitespace())
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped());
+    command
+}
+
+fn run(arguments: &str) -> (Option<i32>, String, String) {
+    said(&cantap(arguments).output().unwrap())
+}
+
+fn said(output: &Output) -> (Option<i32>, String, String) {
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    (output.status.code(), text(&output.stdout), text(&output.stderr))
+}
+
+/// A server that runs.
+struct Server {
+    child: Child,
+    /// Where it listens, as it prints it.
+    at: Vec<String>,
+}
+
+impl Server {
+    fn start(arguments: &str, ways: usize) -> Self {
+        let mut child = cantap(&format!("serve {arguments}")).stderr(Stdio::inherit()).spawn().unwrap();
+        let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+        let at = (0..ways).map(|_| lines.next().expect("it listens").unwrap()).collect();
+        Self { child, at }
+    }
+
+    fn interrupt(&mut self) -> ExitStatus {
+        signal(&self.child, Signal::INT);
+        self.child.wait().unwrap()
+    }
+}
+
+impl Drop for Server {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn signal(child: &Child, signal: Signal) {
+    kill_process(Pid::from_child(child), signal).unwrap();
+}
+
+fn socket(folder: &Path) -> String {
+    folder.join("cantap.sock").display().to_string()
+}
+
+/// A candump log's lines as (seconds, channel and frame), without errors and losses.
+fn log(path: &Path) -> Vec<(f64, String)> {
+    let text = std::fs::read_to_string(path).unwrap();
+    let line = |line: &str| {
+        let (time, frame) = line.split_once(") ")?;
+        Some((time.trim_start_matches('(').parse().ok()?, frame.to_owned()))
+    };
+    text.lines().filter_map(line).filter(|(_, frame)| !frame.contains(" 20000")).collect()
+}
+
+/// Two traces of one bus: the frames that both have, one after the other, are the same, at the same times.
+fn agree(one: &[(f64, String)], other: &[(f64, String)]) {
+    let of = |all: &[(f64, String)], channel: &str| {
+        all.iter().filter(|(_, frame)| frame.starts_with(channel)).cloned().collect::<Vec<_>>()
+    };
+    for channel in ["can0", "can1"] {
+        let (one, other) = (of(one, channel), of(other, channel));
+        assert!(one.len() > 100 && other.len() > 100, "{channel}: {} and {}", one.len(), other.len());
+        let frames = |of: &[(f64, String)], at: usize| {
+            of[at..at + 12].iter().map(|(_, frame)| frame.clone()).collect::<Vec<_>>()
+        };
+        let find =
+            |of: &[(f64, String)], what: &[String]| (0..of.len() - 12).find(|at| frames(of, *at) == what);
+        // Whichever began later is within the other.
+        let (from, to) = match find(&one, &frames(&other, 0)) {
+            Some(at) => (at, 0),
+            None => (0, find(&other, &frames(&one, 0)).expect("common frames")),
+        };
+        let common = (one.len() - from).min(other.len() - to);
+        assert!(common > 100, "{channel}: {common}");
+        for (a, b) in one[from..].iter().zip(&other[to..]) {
+            assert_eq!(a.1, b.1);
+            // Each has measured UTC by its own round trips, on a busy computer.
+            assert!((a.0 - b.0).abs() < 0.02, "{a:?} {b:?}");
+        }
+    }
+}
+
+fn capture(at: &str, file: &Path, rest: &str) -> Command {
+    cantap(&format!("capture -d {at} -o {} --json {rest}", file.display()))
+}
+
+fn nothing_lost(output: &Output) {
+    let (code, out, err) = said(output);
+    assert_eq!(code, Some(0), "{err}");
+    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
+    for stage in summary["lost"].as_object().unwrap() {
+        assert_eq!(*stage.1, 0, "{summary}");
+    }
+}
+
+#[test]
+fn programs_share_a_device_each_with_all_of_its_frames() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let mut server = Server::start(&format!("-d virtual:load=80 -b 500k --unix {path} --tcp 0"), 2);
+    assert_eq!(server.at[0], format!("unix:{path}"));
+    assert!(server.at[1].starts_with("tcp://127.0.0.1:"), "{:?}", server.at);
+    assert_eq!(std::fs::metadata(&path).unwrap().permissions().mode() & 0o777, 0o600);
+    let files: Vec<PathBuf> = (0..3).map(|number| folder.path().join(format!("{number}.log"))).collect();
+    // One without a bit rate takes the server's.
+    let captures: Vec<Child> = [(&server.at[0], "-b 500k"), (&server.at[0], ""), (&server.at[1], "")]
+        .iter()
+        .zip(&files)
+        .map(|((at, rate), file)| capture(at, file, &format!("{rate} -t 1s")).spawn().unwrap())
+        .collect();
+    for capture in captures {
+        nothing_lost(&capture.wait_with_output().unwrap());
+    }
+    agree(&log(&files[0]), &log(&files[1]));
+    agree(&log(&files[0]), &log(&files[2]));
+    // Every command takes the address.
+    let (code, out, err) = run(&format!("info -d {} --json", server.at[0]));
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("VIRTUAL"), "{out}");
+    let (code, out, err) = run(&format!("stats -d {} -t 500ms", server.at[1]));
+    assert_eq!(code, Some(0), "{out}{err}");
+    // What is not granted is refused, with the way out.
+    let (code, _, err) = run(&format!("send -d {} 1 123#11", server.at[0]));
+    assert_eq!(code, Some(1));
+    assert!(err.contains("the right to send") && err.contains("--allow send"), "{err}");
+    let (code, _, err) =
+        run(&format!("capture -d {} -b 125k -n 1 -o /dev/null --format candump", server.at[0]));
+    assert_eq!(code, Some(1));
+    assert!(err.contains("another bit rate"), "{err}");
+    assert!(server.interrupt().success());
+    assert!(!Path::new(&path).exists());
+    let (code, _, err) =
+        run(&format!("capture -d {} -b 500k -n 1 -o /dev/null --format candump", server.at[0]));
+    assert_eq!(code, Some(1));
+    assert!(err.contains("there is no server; start one with `cantap serve`"), "{err}");
+}
+
+#[test]
+fn who_may_send_sends_and_others_see_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let server = Server::start(&format!("-d virtual:load=0 -b 500k --unix {path} --allow send"), 1);
+    let at = &server.at[0];
+    let file = folder.path().join("heard.log");
+    let listener = capture(at, &file, "-t 3s").spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(800));
+    let (code, out, err) = run(&format!("send -d {at} -b 500k 1 123#112233"));
+    assert_eq!(code, Some(0), "{out}{err}");
+    let (code, out, err) = run(&format!("gen -d {at} -b 500k -n 50 -g 2 can1"));
+    assert_eq!(code, Some(0), "{out}{err}");
+    let output = listener.wait_with_output().unwrap();
+    nothing_lost(&output);
+    let heard = log(&file);
+    assert_eq!(
+        heard.iter().filter(|(_, frame)| frame.starts_with("can0 123#112233")).count(),
+        1,
+        "{heard:?}"
+    );
+    assert_eq!(heard.iter().filter(|(_, frame)| frame.starts_with("can1 ")).count(), 50);
+}
+
+/// A stand-in for ssh: what the other computer's shell would do, on this one.
+fn ssh(folder: &Path) -> PathBuf {
+    let program = folder.join("ssh");
+    std::fs::write(
+        &program,
+        "#!/bin/sh\n[ \"$1 $2 $3\" = '-T -oBatchMode=yes --' ] || exit 255\nshift 4\nexec sh -c \"$*\"\n",
+    )
+    .unwrap();
+    std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
+    program
+}
+
+#[test]
+fn a_capture_through_ssh_is_one_made_beside_it() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let server = Server::start(&format!("-d virtual:load=70 -b 500k --unix {path}"), 1);
+    let bin = Path::new(CANTAP).parent().unwrap().display().to_string();
+    let search = format!("{bin}:{}", std::env::var("PATH").unwrap());
+    let through = |command: &mut Command| {
+        command.env("CANTAP_SSH", ssh(folder.path())).env("PATH", &search).spawn().unwrap()
+    };
+    let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
+    let beside = capture(&server.at[0], &near, "-t 2500ms").spawn().unwrap();
+    // A server's board is as good a device as any.
+    let remote = through(&mut capture(&format!("ssh://me@there/unix:{path}"), &far, "-b 500k -t 1s"));
+    nothing_lost(&remote.wait_with_output().unwrap());
+    nothing_lost(&beside.wait_with_output().unwrap());
+    agree(&log(&near), &log(&far));
+    // It listens unless the address says otherwise.
+    let send = |at: &str| {
+        said(&through(&mut cantap(&format!("send -d {at} -b 500k 1 123#11"))).wait_with_output().unwrap())
+    };
+    let (code, _, err) = send("ssh://there/virtual");
+    assert_eq!(code, Some(1));
+    assert!(err.contains("the right to send"), "{err}");
+    let (code, _, err) = send("ssh://there/virtual?allow=send");
+    assert_eq!(code, Some(0), "{err}");
+    // Ctrl-C ends the capture, and then the other side: whole, with its summary.
+    let mut interrupted =
+        through(&mut capture("ssh://there/virtual:load=50", &folder.path().join("c.log"), "-b 500k"));
+    std::thread::sleep(Duration::from_millis(1500));
+    signal(&interrupted, Signal::INT);
+    let started = Instant::now();
+    while interrupted.try_wait().unwrap().is_none() {
+        assert!(started.elapsed() < Duration::from_secs(5), "it does not end");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+    nothing_lost(&interrupted.wait_with_output().unwrap());
+}
+
+#[test]
+fn a_server_that_is_killed_leaves_a_gap_and_the_capture_goes_on_with_the_next() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = socket(folder.path());
+    let start = || Server::start(&format!("-d virtual:load=30 -b 500k --unix {path}"), 1);
+    let server = start();
+    let file = folder.path().join("all.log");
+    let listener = capture(&server.at[0], &file, "-t 5s").spawn().unwrap();
+    std::thread::sleep(Duration::from_millis(1200));
+    // Kill -9: its socket stays behind, which the next one replaces.
+    drop(server);
+    assert!(Path::new(&path).exists());
+    let _server = start();
+    let (code, out, err) = said(&listener.wait_with_output().unwrap());
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("vanished") && err.contains("is back after"), "{err}");
+    let summary: serde_json::Value = serde_json::from_str(&out).unwrap();
+    assert_eq!(summary["gaps"]["count"], 1, "{summary}");
+}
+
+/// Garbage, half-open peers and floods harm nobody, and hear nothing.
+#[test]
+fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {
+    let mut server = Server::start("-d virtual:load=30 -b 500k --tcp 0", 1);
+    let at = server.at[0].clone();
+    let place = at.strip_prefix("tcp://").unwrap();
+    let mut browser = TcpStream::connect(place).unwrap();
+    browser.write_all(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n").unwrap();
+    let flood: Vec<TcpStream> = (0..60).map(|_| TcpStream::connect(place).unwrap()).collect();
+    browser.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    let mut heard = Vec::new();
+    // It is let go without a byte: whoever does not greet has nothing to say.
+    let closed = browser.read_to_end(&mut heard);
+    assert!(closed.is_ok() && heard.is_empty(), "{closed:?} {heard:?}");
+    drop(flood);
+    for _ in 0..50 {
+        drop(TcpStream::connect(place).unwrap());
+    }
+    let file = tempfile::NamedTempFile::new().unwrap();
+    nothing_lost(&capture(&at, file.path(), "--format candump --force -t 500ms").output().unwrap());
+    assert!(server.interrupt().success());
+}
+
+#[test]
+fn what_cannot_be_served_is_said_at_once() {
+    for (arguments, code, part) in [
+        ("serve -d virtual -b 500k --tcp 0.0.0.0", 2, "everybody on every network"),
+        ("serve -d virtual -b 500k --tcp 192.0.2.1", 2, "everybody on the network"),
+        ("serve -d virtual -b 500k --tcp here", 2, "write it as 127.0.0.1:29537"),
+        ("serve -d virtual -b 3:500k", 2, "no channel 3"),
+        ("serve -d virtual -b 500k --unix /nowhere/at/all", 1, "no socket can be made at '/nowhere/at/all'"),
+        ("serve -d /dev/nothing -b 500k", 1, "there is no device at '/dev/nothing'"),
+        ("serve -d virtual -d virtual --stdio", 2, "--stdio serves one device"),
+        ("capture -d tcp://127.0.0.1:9 -b 500k", 1, "there is no server"),
+        ("capture -d ssh://-oProxyCommand=x -b 500k", 2, "is no name of a computer"),
+    ] {
+        let (exit, out, err) = run(arguments);
+        assert_eq!(exit, Some(code), "{arguments}: {out}{err}");
+        assert!(err.contains(part), "{arguments}: {err}");
+    }
+}

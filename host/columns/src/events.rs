@@ -1,0 +1,163 @@
+//! The columns that every table begins with: when, on which channel, what happened, and how often.
+
+use std::sync::Arc;
+
+use arrow_array::ArrayRef;
+use arrow_array::builder::{BooleanBuilder, TimestampNanosecondBuilder, UInt8Builder, UInt32Builder};
+use arrow_array::types::Int8Type;
+use arrow_schema::{DataType, Field, TimeUnit};
+use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES, name};
+use cantap_trace::{TraceEvent, TraceRecord};
+use cantap_wire::record::TransmitFailure;
+
+use crate::texts::Texts;
+
+/// The zone of all times.
+pub const UTC: &str = "UTC";
+
+/// What a row is if it is none of the table's own.
+pub const LOST: &str = "lost";
+pub const BUS_ERROR: &str = "bus-error";
+pub const SUPPRESSED: &str = "errors-suppressed";
+pub const STATE: &str = "state";
+pub const TRANSMIT_FAILED: &str = "transmit-failed";
+/// Their order in the column of events, behind the table's own.
+const KINDS: [&str; 5] = [LOST, BUS_ERROR, SUPPRESSED, STATE, TRANSMIT_FAILED];
+
+/// The columns' names and types.
+pub fn fields() -> Vec<Field> {
+    let texts = Texts::<Int8Type>::data_type();
+    vec![
+        Field::new("time", DataType::Timestamp(TimeUnit::Nanosecond, Some(UTC.into())), false),
+        Field::new("channel", DataType::UInt8, false),
+        Field::new("event", texts.clone(), false),
+        Field::new("detail", texts, true),
+        Field::new("count", DataType::UInt32, true),
+        Field::new("at_least", DataType::Boolean, true),
+        Field::new("tx_errors", DataType::UInt8, true),
+        Field::new("rx_errors", DataType::UInt8, true),
+        Field::new("tag", DataType::UInt32, true),
+    ]
+}
+
+/// The columns under construction.
+pub struct Events {
+    time: TimestampNanosecondBuilder,
+    channel: UInt8Builder,
+    event: Texts<Int8Type>,
+    detail: Texts<Int8Type>,
+    details: Vec<&'static str>,
+    count: UInt32Builder,
+    at_least: BooleanBuilder,
+    tx_errors: UInt8Builder,
+    rx_errors: UInt8Builder,
+    tag: UInt32Builder,
+}
+
+/// What a record says beside time and channel.
+#[derive(Default)]
+struct Said {
+    /// The index in the column of events; 0 is the table's own.
+    event: i8,
+    detail: Option<&'static str>,
+    count: Option<u32>,
+    at_least: Option<bool>,
+    counters: Option<(u8, u8)>,
+    tag: Option<u32>,
+}
+
+impl Events {
+    /// For a table whose own rows are called `own`.
+    pub fn new(own: &str) -> Self {
+        let mut details = Vec::new();
+        let names = LOSS_STAGES.map(|(_, name)| name).into_iter();
+        let names = names.chain(BUS_ERRORS.map(|(_, name)| name)).chain(ERROR_STATES.map(|(_, name)| name));
+        for name in names.chain(TRANSMIT_FAILURES.map(|(_, name)| name)).chain([OVERTAKEN]) {
+            if !details.contains(&name) {
+                details.push(name);
+            }
+        }
+        Self {
+            time: TimestampNanosecondBuilder::new().with_timezone(UTC),
+            channel: UInt8Builder::new(),
+            event: Texts::new([own].into_iter().chain(KINDS)),
+            detail: Texts::new(&details),
+            details,
+            count: UInt32Builder::new(),
+            at_least: BooleanBuilder::new(),
+            tx_errors: UInt8Builder::new(),
+            rx_errors: UInt8Builder::new(),
+            tag: UInt32Builder::new(),
+        }
+    }
+
+    /// Appends a row for the record; a frame is one of the table's own.
+    pub fn push(&mut self, record: &TraceRecord) {
+        let said = Said::of(&record.event);
+        let index = |detail| self.details.iter().position(|known| *known == detail).map(|at| at as i8);
+        let detail = said.detail.and_then(index);
+        self.time.append_value(record.time_ns);
+        self.channel.append_value(record.channel);
+        self.event.push(said.event);
+        self.detail.push_option(detail);
+        self.count.append_option(said.count);
+        self.at_least.append_option(said.at_least);
+        self.tx_errors.append_option(said.counters.map(|(tx, _)| tx));
+        self.rx_errors.append_option(said.counters.map(|(_, rx)| rx));
+        self.tag.append_option(said.tag);
+    }
+
+    /// The columns so far; the next ones begin empty.
+    pub fn take(&mut self) -> Vec<ArrayRef> {
+        vec![
+            Arc::new(self.time.finish()),
+            Arc::new(self.channel.finish()),
+            self.event.take(),
+            self.detail.take(),
+            Arc::new(self.count.finish()),
+            Arc::new(self.at_least.finish()),
+            Arc::new(self.tx_errors.finish()),
+            Arc::new(self.rx_errors.finish()),
+            Arc::new(self.tag.finish()),
+        ]
+    }
+}
+
+impl Said {
+    fn of(event: &TraceEvent) -> Self {
+        let kind = |kind| 1 + KINDS.iter().position(|known| *known == kind).unwrap_or(0) as i8;
+        match *event {
+            TraceEvent::Frame { .. } => Self::default(),
+            TraceEvent::Lost { stage, count, at_least } => Self {
+                event: kind(LOST),
+                detail: stage.map(|stage| name(&LOSS_STAGES, &stage)),
+                count: Some(count),
+                at_least: Some(at_least),
+                ..Self::default()
+            },
+            TraceEvent::BusError { kind: error, counters } => Self {
+                event: kind(BUS_ERROR),
+                detail: error.map(|error| name(&BUS_ERRORS, &error)),
+                counters,
+                ..Self::default()
+            },
+            TraceEvent::ErrorsSuppressed { count } => {
+                Self { event: kind(SUPPRESSED), count: Some(count), ..Self::default() }
+            }
+            TraceEvent::State { state, counters } => Self {
+                event: kind(STATE),
+                detail: Some(name(&ERROR_STATES, &state)),
+                counters,
+                ..Self::default()
+            },
+            TraceEvent::TransmitFailed { tag, reason } => {
+                let (detail, count) = match reason {
+                    TransmitFailure::Overtaken { periods } => (OVERTAKEN, Some(periods)),
+                    _ => (name(&TRANSMIT_FAILURES, &reason), None),
+                };
+                let (detail, tag) = (Some(detail), Some(tag));
+                Self { event: kind(TRANSMIT_FAILED), detail, count, tag, ..Self::default() }
+            }
+        }
+    }
+}

@@ -1,0 +1,21 @@
+#![doc = include_str!("../README.md")]
+#![forbid(unsafe_code)]
+
+mod events;
+mod frames;
+mod messages;
+#[cfg(feature = "parquet")]
+pub mod parquet;
+mod records;
+mod signals;
+mod texts;
+mod wide;
+
+pub use frames::FrameColumns;
+pub use messages::MessageColumns;
+pub use records::{BadColumns, records};
+pub use signals::SignalColumns;
+pub use wide::WideColumns;
+
+/// Rows that a batch has at most where nothing else is asked for: a few megabytes, and what a reader of Parquet takes at once.
+pub const BATCH_ROWS: usize = 1 << 16;

@@ -1,0 +1,74 @@
+//! One file.
+
+use std::fs::{self, File};
+use std::io::{self, BufWriter};
+use std::path::{Path, PathBuf};
+
+use parquet::arrow::ArrowWriter;
+use parquet::basic::{Compression, ZstdLevel};
+use parquet::errors::ParquetError;
+use parquet::file::properties::WriterProperties;
+
+use super::Table;
+use crate::BATCH_ROWS;
+
+/// Rows of a row group: what a reader that looks for an interval of time skips or takes as a whole.
+const GROUP_ROWS: usize = 1 << 19;
+/// What zstd's own command takes unless told otherwise.
+const ZSTD_LEVEL: i32 = 3;
+
+/// A Parquet file that takes its name only when it is whole: an older one of that name stays as it is until then.
+pub struct ParquetFile<T> {
+    /// What to put rows into; [`Self::flush`] them now and then.
+    pub table: T,
+    writer: ArrowWriter<BufWriter<File>>,
+    temporary: Temporary,
+    path: PathBuf,
+}
+
+/// Removed if it is still there at the end.
+struct Temporary(PathBuf);
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+impl<T: Table> ParquetFile<T> {
+    /// Begins a file, in a folder that is there.
+    pub fn create(path: &Path, table: T) -> Result<Self, ParquetError> {
+        let name = path.file_name().ok_or_else(|| io::Error::from(io::ErrorKind::InvalidFilename))?;
+        let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
+        temporary.push(name);
+        let temporary = Temporary(path.with_file_name(temporary));
+        let file = BufWriter::new(File::create(&temporary.0)?);
+        let properties = WriterProperties::builder()
+            .set_compression(Compression::ZSTD(ZstdLevel::try_new(ZSTD_LEVEL)?))
+            .set_max_row_group_row_count(Some(GROUP_ROWS))
+            .set_created_by(concat!("cantap ", env!("CARGO_PKG_VERSION")).to_owned())
+            .build();
+        let writer = ArrowWriter::try_new(file, table.columns(), Some(properties))?;
+        Ok(Self { table, writer, temporary, path: path.to_owned() })
+    }
+
+    /// Writes the table's rows if they are worth a batch.
+    pub fn flush(&mut self) -> Result<(), ParquetError> {
+        if self.table.waiting() < BATCH_ROWS { Ok(()) } else { self.write() }
+    }
+
+    fn write(&mut self) -> Result<(), ParquetError> {
+        self.writer.write(&self.table.batch())
+    }
+
+    /// Writes what is left, and puts the file in its place.
+    pub fn finish(mut self) -> Result<(), ParquetError> {
+        if self.table.waiting() > 0 {
+            self.write()?;
+        }
+        let file = self.writer.into_inner()?;
+        file.into_inner().map_err(io::IntoInnerError::into_error)?.sync_all()?;
+        fs::rename(&self.temporary.0, &self.path)?;
+        Ok(())
+    }
+}

@@ -1,0 +1,47 @@
+//! Columns of texts out of a set that is known beforehand: an index per row, and the texts once.
+
+use std::sync::Arc;
+
+use arrow_array::builder::PrimitiveBuilder;
+use arrow_array::types::ArrowDictionaryKeyType;
+use arrow_array::{ArrayRef, DictionaryArray, StringArray};
+use arrow_schema::DataType;
+
+/// A column under construction. Every batch of it has the same texts, so that readers who join batches need not compare them.
+pub struct Texts<K: ArrowDictionaryKeyType> {
+    texts: Arc<StringArray>,
+    keys: PrimitiveBuilder<K>,
+}
+
+impl<K: ArrowDictionaryKeyType> Texts<K> {
+    /// A column of these texts; there must be fewer than the index can count.
+    pub fn new<T: AsRef<str>>(texts: impl IntoIterator<Item = T>) -> Self {
+        Self { texts: Arc::new(StringArray::from_iter_values(texts)), keys: PrimitiveBuilder::new() }
+    }
+
+    /// An empty column of the same texts.
+    pub fn another(&self) -> Self {
+        Self { texts: Arc::clone(&self.texts), keys: PrimitiveBuilder::new() }
+    }
+
+    /// The type of such a column.
+    pub fn data_type() -> DataType {
+        DataType::Dictionary(Box::new(K::DATA_TYPE), Box::new(DataType::Utf8))
+    }
+
+    /// Appends the text of this index.
+    pub fn push(&mut self, key: K::Native) {
+        self.keys.append_value(key);
+    }
+
+    /// Appends the text of this index, or none.
+    pub fn push_option(&mut self, key: Option<K::Native>) {
+        self.keys.append_option(key);
+    }
+
+    /// The column so far; the next one begins empty.
+    pub fn take(&mut self) -> ArrayRef {
+        let texts = Arc::clone(&self.texts) as ArrayRef;
+        Arc::new(DictionaryArray::new(self.keys.finish(), texts))
+    }
+}

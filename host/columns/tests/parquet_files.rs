@@ -1,0 +1,99 @@
+//! Parquet files and datasets of them hold what was put into them.
+#![cfg(feature = "parquet")]
+
+use std::fs::{self, File};
+use std::path::Path;
+
+use cantap_columns::parquet::{Dataset, Key, ParquetFile};
+use cantap_columns::{FrameColumns, records};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use parquet::arrow::arrow_reader::ParquetRecordBatchReaderBuilder;
+
+const DAY_NS: i64 = 86_400_000_000_000;
+
+fn frame(time_ns: i64, channel: u8) -> TraceRecord {
+    let frame = "123#DEADBEEF".parse().unwrap();
+    TraceRecord {
+        time_ns,
+        channel,
+        event: TraceEvent::Frame { frame, direction: Direction::Tx, late: false },
+    }
+}
+
+fn read(path: &Path) -> Vec<TraceRecord> {
+    let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(path).unwrap()).unwrap();
+    reader.build().unwrap().flat_map(|batch| records(&batch.unwrap()).unwrap()).collect()
+}
+
+#[test]
+fn a_file_takes_the_place_of_an_older_one_only_when_it_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("drive.parquet");
+    fs::write(&path, "older").unwrap();
+    let mut file = ParquetFile::create(&path, FrameColumns::default()).unwrap();
+    let trace: Vec<_> = (0..200_000).map(|number| frame(number * 1_000, 1)).collect();
+    for record in &trace {
+        file.table.push(record);
+        file.flush().unwrap();
+    }
+    assert_eq!(fs::read(&path).unwrap(), b"older");
+    file.finish().unwrap();
+    assert_eq!(read(&path), trace);
+    drop(ParquetFile::create(&path, FrameColumns::default()).unwrap());
+    let names: Vec<_> = fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().file_name()).collect();
+    assert_eq!(names, ["drive.parquet"], "what was not finished leaves nothing behind");
+}
+
+#[test]
+fn a_dataset_has_a_folder_for_each_day_and_channel() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = vec!["vehicle=a/b".parse().unwrap(), Key::Day, Key::Channel];
+    let write = || {
+        let mut dataset = Dataset::new(folder.path(), "drive", keys.clone(), FrameColumns::default);
+        // Seventeen days of two channels are more files than are open at once; each is come back to.
+        for turn in 0..2 {
+            for day in 0..17 {
+                for channel in [1, 2] {
+                    let record = frame(day * DAY_NS + turn, channel);
+                    dataset.table_of(&record).unwrap().push(&record);
+                }
+            }
+        }
+        dataset.finish().unwrap();
+    };
+    write();
+    let first = listing(folder.path());
+    assert!(first.contains(&"vehicle=a%2Fb/day=1970-01-17/channel=2/drive.parquet".to_owned()), "{first:?}");
+    let path = |day: &str| folder.path().join("vehicle=a%2Fb").join(day).join("channel=1");
+    let mut rows = read(&path("day=1970-01-02").join("drive.parquet"));
+    rows.extend(read(&path("day=1970-01-02").join("drive-2.parquet")));
+    assert_eq!(rows, [frame(DAY_NS, 1), frame(DAY_NS + 1, 1)]);
+    write();
+    assert_eq!(listing(folder.path()), first, "written again it is the same");
+}
+
+fn listing(folder: &Path) -> Vec<String> {
+    let mut names = Vec::new();
+    let mut folders = vec![folder.to_owned()];
+    while let Some(inside) = folders.pop() {
+        for entry in fs::read_dir(inside).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_dir() {
+                folders.push(path);
+            } else {
+                names.push(path.strip_prefix(folder).unwrap().display().to_string());
+            }
+        }
+    }
+    names.sort_unstable();
+    names
+}
+
+#[test]
+fn folders_are_named_by_words() {
+    assert_eq!("day".parse(), Ok(Key::Day));
+    assert_eq!("vehicle=Ü 7".parse(), Ok(Key::Fixed("vehicle".into(), "Ü 7".into())));
+    for text in ["", "days", "=7", "vehicle=", "a b=c", "../x=y"] {
+        assert!(text.parse::<Key>().is_err(), "{text}");
+    }
+}

@@ -1,0 +1,572 @@
+//! The board that is shared: the session with it, which begins anew whenever it is there, and questions to it.
+
+use std::io::{Read, Write};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{Sender, sync_channel};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use cantap::DeviceError;
+use cantap::device::{Link, Next, PIECE_BYTES, SessionOver, Watch, encode, is_idle, pipe, write_patiently};
+use cantap_wire::message::{ChannelConfig, EndReason, Mode, Role};
+use cantap_wire::record::LossStage;
+use cantap_wire::{
+    BitTiming, CHANNELS, Channel, Command, Corruption, Decoded, Decoder, Event, Hello, PROTOCOL_VERSION,
+    Refusal, Reply, Request, Response,
+};
+
+use crate::client;
+use crate::news::News;
+use crate::outbox::{Item, MOST_RECORDS};
+use crate::state::{Asked, State, Then};
+use crate::stream::{ClientId, Entry};
+
+/// Connects to the board: the one with this serial number, if one was there before and it can be found by it.
+pub type Connect = Box<dyn FnMut(Option<&str>) -> Result<Link, ConnectError> + Send>;
+/// Why it could not.
+pub type ConnectError = Box<dyn std::error::Error + Send + Sync>;
+
+/// Why a board cannot be shared.
+#[derive(Debug, thiserror::Error)]
+pub enum BoardError {
+    /// It is there, and something is wrong with it.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// There is no way to it.
+    #[error(transparent)]
+    Connect(ConnectError),
+}
+
+/// How long after a failure the board is tried again.
+const RETRY_AFTER: Duration = Duration::from_millis(500);
+/// `Hello` is tried so often, since a board may have half a line of somebody else's in its input.
+const HELLO_TRIES: u32 = 3;
+/// So long for each try, and for each other question before there are clients.
+const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
+/// Longest answer of a board: saving takes two seconds.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
+/// A board makes us wait while it has no room; one that takes nothing for so long is stuck.
+const WRITE_PATIENCE: Duration = Duration::from_secs(2);
+/// So long a server that ends waits for what its clients are to be told.
+const LAST_WORDS: Duration = Duration::from_millis(1500);
+/// Read at a time.
+const READ_BYTES: usize = 64 * 1024;
+/// Bytes on their way to a client in this process, and back.
+const PIPE_BYTES: usize = 64 * 1024;
+
+/// How a board is shared.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The bit rate of each channel's bus, in bit/s, at which clients hear it who choose none. Where there is none it is the one saved on
+    /// the board, if one is; else a client has to choose it, which takes [`Role::Configure`].
+    pub bitrates_bps: [Option<u32>; CHANNELS],
+    /// Records that wait for a slow client at most.
+    pub most_records: usize,
+    /// Clients at a time.
+    pub most_clients: usize,
+}
+
+impl Settings {
+    /// The same bit rate for both channels, in bit/s.
+    pub fn at(bitrate_bps: u32) -> Self {
+        Self { bitrates_bps: [Some(bitrate_bps); CHANNELS], ..Self::default() }
+    }
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { bitrates_bps: [None; CHANNELS], most_records: MOST_RECORDS, most_clients: 32 }
+    }
+}
+
+/// A shared board. Dropping it ends every session, and the board leaves its buses.
+pub struct Board {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+/// What the threads share.
+pub(crate) struct Shared {
+    pub name: String,
+    pub settings: Settings,
+    port: Mutex<Option<Box<dyn Write + Send>>>,
+    state: Mutex<State>,
+    /// Something has come from the board.
+    changed: Condvar,
+    /// Held by whoever opens and closes channels: one at a time.
+    pub setup: Mutex<()>,
+    quit: AtomicBool,
+    next_client: AtomicU64,
+    news: Box<dyn Fn(News) + Send + Sync>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every holder leaves the state whole, even if it panicked elsewhere.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Board {
+    /// Begins a session with a board, which must be there now and may go and come back later; messages call it `name`. `news` is
+    /// told what happens, from any thread, and must not wait.
+    pub fn start(
+        name: &str,
+        connect: Connect,
+        settings: Settings,
+        news: impl Fn(News) + Send + Sync + 'static,
+    ) -> Result<Self, BoardError> {
+        let shared = Arc::new(Shared {
+            name: name.to_owned(),
+            settings,
+            port: Mutex::new(None),
+            state: Mutex::default(),
+            changed: Condvar::new(),
+            setup: Mutex::default(),
+            quit: AtomicBool::new(false),
+            next_client: AtomicU64::new(1),
+            news: Box::new(news),
+        });
+        let (first, began) = std::sync::mpsc::channel();
+        let for_thread = Arc::clone(&shared);
+        let thread = std::thread::Builder::new()
+            .name("cantap-board".to_owned())
+            .spawn(move || run(&for_thread, connect, first))
+            .map_err(DeviceError::Thread)?;
+        let board = Self { shared, thread: Some(thread) };
+        match began.recv() {
+            Ok(Ok(())) => Ok(board),
+            Ok(Err(error)) => Err(error),
+            Err(_) => Err(DeviceError::WrongReply.into()),
+        }
+    }
+
+    /// What the board is, while it is there.
+    pub fn hello(&self) -> Option<Hello> {
+        self.shared.state().hello.clone()
+    }
+
+    /// As messages call it.
+    pub fn name(&self) -> &str {
+        &self.shared.name
+    }
+
+    /// The bit rate of each channel at which clients hear it who choose none, in bit/s.
+    pub fn bitrates_bps(&self) -> [Option<u32>; CHANNELS] {
+        let state = self.shared.state();
+        let clock_hz = state.hello.as_ref().map_or(1, |hello| hello.can_clock_hz);
+        state.base.map(|config| config.map(|config| config.timing.bitrate_bps(clock_hz)))
+    }
+
+    /// How many clients there are.
+    pub fn clients(&self) -> usize {
+        self.shared.state().clients.len()
+    }
+
+    pub(crate) fn tell(&self, news: News) {
+        self.shared.tell(news);
+    }
+
+    /// Lets a client in that speaks through a stream; messages call it `name`. `input` must return within a fraction of a second, as a
+    /// [`Link`]'s reader. Returns when it is in; threads of its own serve it.
+    pub fn admit(
+        &self,
+        input: impl Read + Send + 'static,
+        output: impl Write + Send + 'static,
+        name: &str,
+        role: Role,
+    ) -> Result<(), Refused> {
+        client::admit(&self.shared, Box::new(input), Box::new(output), name, role)
+    }
+
+    /// A client in this process: what it makes a device of.
+    pub fn link(&self, name: &str, role: Role) -> Result<Link, Refused> {
+        let (reader, output) = pipe(PIPE_BYTES);
+        let (input, writer) = pipe(PIPE_BYTES);
+        self.admit(input, output, name, role)?;
+        Ok(Link::new(reader, writer))
+    }
+}
+
+/// Why a client was not let in.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// There are as many as there may be.
+    #[error("there are {0} clients already")]
+    TooMany(usize),
+    /// The server ends.
+    #[error("the server ends")]
+    Over,
+    /// The system has no thread left.
+    #[error("the system refused a thread: {0}")]
+    Thread(#[source] std::io::Error),
+}
+
+impl Drop for Board {
+    fn drop(&mut self) {
+        self.shared.quit.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        // Clients that read learn that it is over.
+        self.shared.wait_for(LAST_WORDS, |state| state.writers == 0);
+    }
+}
+
+impl Shared {
+    pub fn state(&self) -> MutexGuard<'_, State> {
+        lock(&self.state)
+    }
+
+    pub fn tell(&self, news: News) {
+        (self.news)(news);
+    }
+
+    pub fn next_client(&self) -> ClientId {
+        self.next_client.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Asks the board and waits for its answer. What is to happen in the order of its stream is `then`.
+    pub fn ask(&self, command: Command, then: Then) -> Result<Reply, Refusal> {
+        let (answer, answered) = sync_channel(1);
+        let id = self.send(command, Asked { answer, then })?;
+        answered.recv_timeout(ANSWER_TIMEOUT).unwrap_or_else(|_| {
+            self.state().asked.remove(&id);
+            Err(Refusal::NoBoard)
+        })
+    }
+
+    /// Asks without waiting.
+    fn send(&self, command: Command, asked: Asked) -> Result<u16, Refusal> {
+        let id = {
+            let mut state = self.state();
+            if state.hello.is_none() {
+                return Err(Refusal::NoBoard);
+            }
+            state.ask(asked)
+        };
+        let bytes = encode(&Request { id, command }).map_err(|_| Refusal::Malformed)?;
+        let mut port = lock(&self.port);
+        let written = port.as_mut().map(|port| {
+            write_patiently(port, &bytes, WRITE_PATIENCE)?;
+            port.flush()
+        });
+        drop(port);
+        if !matches!(written, Some(Ok(()))) {
+            let mut state = self.state();
+            state.asked.remove(&id);
+            // Half a request may be on its way.
+            state.must_end = true;
+            return Err(Refusal::NoBoard);
+        }
+        Ok(id)
+    }
+
+    /// Asks what nobody waits for.
+    fn send_unattended(&self, command: Command, then: Then) {
+        let (answer, _) = sync_channel(1);
+        // If it fails, the board's thread notices.
+        let _ = self.send(command, Asked { answer, then });
+    }
+
+    /// A client is not written to any more.
+    pub fn has_written(&self) {
+        self.state().writers -= 1;
+        self.changed.notify_all();
+    }
+
+    /// Waits until the board has said what `is_there` looks for, at most `timeout`. Returns whether it has.
+    pub fn wait_for(&self, timeout: Duration, mut is_there: impl FnMut(&State) -> bool) -> bool {
+        let waited = self.changed.wait_timeout_while(self.state(), timeout, |state| !is_there(state));
+        !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
+    }
+}
+
+/// The thread's body: one session with the board after the other.
+fn run(shared: &Arc<Shared>, mut connect: Connect, first: Sender<Result<(), BoardError>>) {
+    let mut first = Some(first);
+    let mut serial: Option<String> = None;
+    let mut told: Option<String> = None;
+    while !shared.quit.load(Ordering::Relaxed) {
+        let connected = connect(serial.as_deref()).map_err(|source| match source.downcast::<DeviceError>() {
+            Ok(error) => BoardError::Device(*error),
+            Err(source) => BoardError::Connect(source),
+        });
+        let session = connected.and_then(|link| Ok(Session::begin(shared, link)?));
+        match session {
+            Ok(session) => {
+                serial = Some(session.hello.serial.as_str().to_owned());
+                told = None;
+                session.publish(shared);
+                match first.take() {
+                    // Whoever started it has gone meanwhile: `quit` says so.
+                    Some(first) => drop(first.send(Ok(()))),
+                    None => shared.tell(News::BoardBack { board: shared.name.clone() }),
+                }
+                let over = session.run(shared);
+                let end = if over.is_some() { EndReason::BoardLost } else { EndReason::ServerEnded };
+                end_sessions(shared, end);
+                if let Some(error) = over {
+                    shared.tell(News::BoardLost { board: shared.name.clone(), reason: error.to_string() });
+                }
+            }
+            Err(error) => {
+                if let Some(first) = first.take() {
+                    let _ = first.send(Err(error));
+                    return;
+                }
+                let reason = error.to_string();
+                if told.as_ref() != Some(&reason) {
+                    shared.tell(News::BoardLost { board: shared.name.clone(), reason: reason.clone() });
+                    told = Some(reason);
+                }
+            }
+        }
+        let retry_at = Instant::now() + RETRY_AFTER;
+        while Instant::now() < retry_at && !shared.quit.load(Ordering::Relaxed) {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+    let mut state = shared.state();
+    state.is_over = true;
+    state.clients.values().for_each(|member| member.outbox.close());
+}
+
+/// Tells every client that its session is over. What it had been sent before comes first.
+fn end_sessions(shared: &Shared, reason: EndReason) {
+    *lock(&shared.port) = None;
+    let mut state = shared.state();
+    let ticks = state.latest_ticks;
+    for member in state.clients.values_mut().filter(|member| member.in_session) {
+        member.in_session = false;
+        member.views.iter_mut().for_each(|view| view.config = None);
+        member.outbox.push(Item::Ended(reason, ticks));
+    }
+    state.forget_board();
+    drop(state);
+    shared.changed.notify_all();
+}
+
+/// A session with the board.
+struct Session {
+    link: Link,
+    decoder: Box<Decoder>,
+    hello: Hello,
+    base: [Option<ChannelConfig>; CHANNELS],
+    /// Device time at its beginning.
+    ticks: u64,
+}
+
+impl Session {
+    /// Greets the board, and learns what there is to know before anybody asks.
+    fn begin(shared: &Shared, link: Link) -> Result<Self, DeviceError> {
+        let Link { mut reader, mut writer, keep_alive } = link;
+        let mut decoder = Box::new(Decoder::new());
+        let mut exchange = |id: u16, command: Command| {
+            exchange(&mut *reader, &mut *writer, &mut decoder, &Request { id, command }, &shared.name)
+        };
+        let not_cantap = || DeviceError::NotCantap { address: shared.name.clone() };
+        // Answers to a host before us must not be taken for ours: begin at an arbitrary number.
+        let start = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+        let mut id = start.map_or(1, |since| (since.as_micros() >> 4) as u16);
+        let mut hello = None;
+        for _ in 0..HELLO_TRIES {
+            id = id.wrapping_add(1);
+            hello = exchange(id, Command::Hello { protocol: PROTOCOL_VERSION })?;
+            if hello.is_some() {
+                break;
+            }
+        }
+        let hello = match hello.ok_or_else(not_cantap)? {
+            Ok(Reply::Hello(hello)) => hello,
+            Ok(_) => return Err(DeviceError::WrongReply),
+            Err(Refusal::Protocol { device }) => return Err(DeviceError::Protocol { device }),
+            Err(refusal) => return Err(DeviceError::Refused { refusal }),
+        };
+        let mut base = [None; CHANNELS];
+        for channel in Channel::ALL.into_iter().take(usize::from(hello.channels)) {
+            id = id.wrapping_add(1);
+            base[channel.index()] = match shared.settings.bitrates_bps[channel.index()] {
+                Some(bitrate_bps) => {
+                    let timing = BitTiming::choose(hello.can_clock_hz, bitrate_bps, None)
+                        .map_err(|reason| DeviceError::BitRate { bitrate_bps, reason })?;
+                    Some(ChannelConfig::listen_only(timing))
+                }
+                None => match exchange(id, Command::Defaults { channel })?.ok_or_else(not_cantap)? {
+                    Ok(Reply::Defaults(saved)) => Some(ChannelConfig::listen_only(saved.config.timing)),
+                    _ => None,
+                },
+            };
+        }
+        let time = exchange(id.wrapping_add(1), Command::Time)?.ok_or_else(not_cantap)?;
+        let Ok(Reply::Time(ticks)) = time else { return Err(DeviceError::WrongReply) };
+        Ok(Self { link: Link { reader, writer, keep_alive }, decoder, hello, base, ticks })
+    }
+
+    /// From now on clients may ask.
+    fn publish(&self, shared: &Shared) {
+        let mut state = shared.state();
+        state.base = self.base;
+        state.latest_ticks = self.ticks;
+        state.hello = Some(self.hello.clone());
+    }
+
+    /// Reads until the board is gone. Returns why, or nothing if the server is to end.
+    fn run(self, shared: &Arc<Shared>) -> Option<DeviceError> {
+        let Link { mut reader, writer, keep_alive } = self.link;
+        let mut decoder = self.decoder;
+        *lock(&shared.port) = Some(writer);
+        let name = || shared.name.clone();
+        let vanished = |reason: String| Some(DeviceError::Vanished { address: name(), reason });
+        let mut bytes = vec![0; READ_BYTES];
+        let mut watch = Watch::default();
+        let mut passed_at = Instant::now();
+        let over = loop {
+            let len = match reader.read(&mut bytes) {
+                Ok(0) => break vanished("the connection was closed".to_owned()),
+                Ok(len) => len,
+                Err(error) if is_idle(&error) => 0,
+                Err(error) => break vanished(error.to_string()),
+            };
+            if shared.quit.load(Ordering::Relaxed) {
+                leave_buses(shared, &mut *reader);
+                break None;
+            }
+            let mut heard = Heard::default();
+            for piece in bytes[..len].chunks(PIECE_BYTES) {
+                let mut state = shared.state();
+                take(&mut state, &mut decoder, piece, &mut heard);
+                let again = std::mem::take(&mut state.again);
+                drop(state);
+                for (channel, frame) in again {
+                    let frames = heapless::Vec::from_iter([frame]);
+                    shared.send_unattended(Command::Send { channel, frames }, Then::SentAgain(frame.tag));
+                }
+            }
+            if len > 0 {
+                shared.changed.notify_all();
+            }
+            if shared.state().must_end {
+                break vanished("it does not take requests any more".to_owned());
+            }
+            if let Some(reason) = heard.end {
+                break Some(DeviceError::SessionEnded { address: name(), reason });
+            }
+            let now = Instant::now();
+            let passed = now.duration_since(std::mem::replace(&mut passed_at, now));
+            match watch.pass(passed, heard.answered) {
+                Next::Listen => {}
+                Next::Ask => shared.send_unattended(Command::Time, Then::Nothing),
+                Next::GiveUp(silent) => {
+                    break Some(DeviceError::Silent { address: name(), seconds: silent.as_secs_f32() });
+                }
+            }
+        };
+        *lock(&shared.port) = None;
+        drop(reader);
+        drop(keep_alive);
+        over
+    }
+}
+
+/// Leaves the buses. A board does that by itself when the port closes; telling it is quicker.
+fn leave_buses(shared: &Shared, reader: &mut dyn Read) {
+    for channel in Channel::ALL {
+        shared.send_unattended(Command::Close { channel }, Then::Nothing);
+    }
+    // A port that closes at once may take what is still to be written with it.
+    let _ = reader.read(&mut [0; 4096]);
+}
+
+/// What was in one read, beside records.
+#[derive(Default)]
+struct Heard {
+    answered: bool,
+    end: Option<SessionOver>,
+}
+
+/// Takes bytes of the board: records go on to the clients, answers to whoever asked.
+fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Heard) {
+    let mut chunk: Vec<Entry> = Vec::new();
+    decoder.push(piece, |decoded| match decoded {
+        Decoded::Record { ticks, record } => chunk.extend(state.take(ticks, record)),
+        Decoded::BatchesLost { frames, .. } => {
+            for (channel, count) in Channel::ALL.into_iter().zip(frames).filter(|(_, count)| *count > 0) {
+                let event = Event::Lost { channel, stage: LossStage::Link, count, at_least: false };
+                chunk.push(Entry::event(state.latest_ticks, event));
+            }
+        }
+        Decoded::Response(Response { id, result }) => {
+            heard.answered = true;
+            if let Err(Refusal::NoSession) = result {
+                heard.end = heard.end.or(Some(SessionOver::Refused));
+            }
+            let Some(Asked { answer, then }) = state.asked.remove(id) else {
+                if matches!(result, Ok(Reply::Hello(_))) {
+                    heard.end = Some(SessionOver::Greeted);
+                }
+                return;
+            };
+            // What came before the answer belongs to before.
+            state.deliver(&mut chunk);
+            match (then, result) {
+                (Then::Opened { client, channel }, Ok(Reply::Opened(config))) => {
+                    state.opened(channel, *config);
+                    if let Some((client, config)) = client {
+                        state.attach(client, channel, config);
+                    }
+                }
+                (Then::SentAgain(tag), Err(_)) => chunk.extend(state.give_up(tag)),
+                _ => {}
+            }
+            // There is room for one; if nobody waits any more, that is fine.
+            let _ = answer.try_send(result.clone());
+        }
+        Decoded::Ended { .. } => heard.end = Some(SessionOver::Suspended),
+        Decoded::Corrupt(Corruption::OutOfOrder { .. }) => heard.end = Some(SessionOver::StreamWentBack),
+        Decoded::Corrupt(_) | Decoded::OtherProtocol(_) => {}
+    });
+    state.deliver(&mut chunk);
+}
+
+/// Asks and waits, before there is a thread to do it. Nothing if nothing is answered in time.
+fn exchange(
+    reader: &mut dyn Read,
+    writer: &mut dyn Write,
+    decoder: &mut Decoder,
+    request: &Request,
+    name: &str,
+) -> Result<Option<Result<Reply, Refusal>>, DeviceError> {
+    let vanished = |reason: String| DeviceError::Vanished { address: name.to_owned(), reason };
+    // The zero ends whatever stands in the board's input, and chooses our language over slcan.
+    let bytes = [vec![0], encode(request)?].concat();
+    write_patiently(writer, &bytes, WRITE_PATIENCE)
+        .and_then(|()| writer.flush())
+        .map_err(|error| vanished(error.to_string()))?;
+    let deadline = Instant::now() + HELLO_TIMEOUT;
+    let mut bytes = [0; 4096];
+    while Instant::now() < deadline {
+        let len = match reader.read(&mut bytes) {
+            Ok(0) => return Err(vanished("the connection was closed".to_owned())),
+            Ok(len) => len,
+            Err(error) if is_idle(&error) => continue,
+            Err(error) => return Err(vanished(error.to_string())),
+        };
+        let mut answer = None;
+        decoder.push(&bytes[..len], |decoded| match decoded {
+            Decoded::Response(response) if response.id == request.id => {
+                answer = Some(response.result.clone());
+            }
+            Decoded::OtherProtocol(device) => answer = Some(Err(Refusal::Protocol { device })),
+            _ => {}
+        });
+        if answer.is_some() {
+            return Ok(answer);
+        }
+    }
+    Ok(None)
+}
+
+/// Whether a mode only listens.
+pub(crate) const fn only_listens(config: &ChannelConfig) -> bool {
+    matches!(config.mode, Mode::ListenOnly)
+}

@@ -1,0 +1,106 @@
+//! Links to a server: what a client makes a device of.
+
+use std::io::{self, Read};
+use std::net::{TcpStream, ToSocketAddrs};
+#[cfg(unix)]
+use std::os::unix::net::UnixStream;
+#[cfg(unix)]
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::time::Duration;
+
+use cantap::device::{Link, pipe};
+
+/// A read or write of a socket returns at the latest after this time.
+pub(crate) const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
+/// A computer that does not answer is given up after this time.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// Bytes of a program's output that wait at most.
+const PIPE_BYTES: usize = 256 * 1024;
+
+/// Where a server's socket is unless somebody says otherwise: the user's own directory for such things, where the system has one.
+#[cfg(unix)]
+pub fn default_socket() -> PathBuf {
+    match std::env::var_os("XDG_RUNTIME_DIR").filter(|folder| !folder.is_empty()) {
+        Some(folder) => Path::new(&folder).join("cantap.sock"),
+        None => std::env::temp_dir().join(format!("cantap-{}.sock", rustix::process::getuid().as_raw())),
+    }
+}
+
+/// To a server on this machine.
+#[cfg(unix)]
+pub fn unix(path: &Path) -> io::Result<Link> {
+    let reader = UnixStream::connect(path)?;
+    reader.set_read_timeout(Some(SOCKET_TIMEOUT))?;
+    reader.set_write_timeout(Some(SOCKET_TIMEOUT))?;
+    let writer = reader.try_clone()?;
+    Ok(Link::new(reader, writer))
+}
+
+/// To a server at `HOST:PORT`, without encryption.
+pub fn tcp(address: &str) -> io::Result<Link> {
+    let reader = dial(address)?;
+    let writer = reader.try_clone()?;
+    Ok(Link::new(reader, writer))
+}
+
+/// A socket that returns within a fraction of a second.
+pub(crate) fn dial(address: &str) -> io::Result<TcpStream> {
+    let mut failed = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
+    for address in address.to_socket_addrs()? {
+        match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
+            Ok(stream) => {
+                prepare(&stream)?;
+                return Ok(stream);
+            }
+            Err(error) => failed = error,
+        }
+    }
+    Err(failed)
+}
+
+pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {
+    stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
+    stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
+    // An answer is a small packet that somebody waits for.
+    stream.set_nodelay(true)
+}
+
+/// To a server that a program is: through its standard input and output. What it says on standard error, the user sees. It ends with the
+/// link.
+pub fn program(command: &mut Command) -> io::Result<Link> {
+    let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+    let (Some(writer), Some(mut output)) = (child.stdin.take(), child.stdout.take()) else {
+        return Err(io::ErrorKind::BrokenPipe.into());
+    };
+    let child = Running(child);
+    // Its output can be waited for only without a limit.
+    let (reader, mut to_reader) = pipe(PIPE_BYTES);
+    std::thread::Builder::new().name("cantap-program".to_owned()).spawn(move || {
+        let mut bytes = vec![0; 64 * 1024];
+        while let Ok(len @ 1..) = output.read(&mut bytes) {
+            let patience = Duration::MAX;
+            if cantap::device::write_patiently(&mut to_reader, &bytes[..len], patience).is_err() {
+                return;
+            }
+        }
+    })?;
+    Ok(Link::new(reader, writer).keeping(child))
+}
+
+/// A program that ends when nobody needs it any more.
+struct Running(Child);
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        // It ends by itself when its input does, unless something holds it up.
+        for _ in 0..20 {
+            if matches!(self.0.try_wait(), Ok(Some(_)) | Err(_)) {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(10));
+        }
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}

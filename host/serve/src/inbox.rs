@@ -1,0 +1,105 @@
+//! A client's requests, found in what it sends.
+
+use cantap_wire::Refusal;
+use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
+use cantap_wire::message::{Request, why_unreadable};
+
+/// Most bytes in front of a zero that can be a request.
+const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
+
+/// What stood between two zeros.
+#[derive(Debug, PartialEq, Eq)]
+#[expect(clippy::large_enum_variant, reason = "one for each request, taken at once")]
+pub enum Heard {
+    /// A request.
+    Request(Request),
+    /// One whose number alone can be read, and what is wrong with it.
+    Unreadable(u16, Refusal),
+    /// What cannot be answered: nobody can tell whose it is.
+    Damaged,
+}
+
+/// Holds at most one request.
+#[derive(Default)]
+pub struct Inbox {
+    partial: Vec<u8>,
+    is_overlong: bool,
+}
+
+impl Inbox {
+    /// Takes any piece of the stream and reports what is complete.
+    pub fn push(&mut self, bytes: &[u8], mut report: impl FnMut(Heard)) {
+        for &byte in bytes {
+            if byte != 0 {
+                if self.partial.len() < MOST {
+                    self.partial.push(byte);
+                } else {
+                    self.is_overlong = true;
+                }
+                continue;
+            }
+            if std::mem::take(&mut self.is_overlong) {
+                report(Heard::Damaged);
+            } else if !self.partial.is_empty() {
+                report(read(&self.partial));
+            }
+            self.partial.clear();
+        }
+    }
+}
+
+fn read(encoded: &[u8]) -> Heard {
+    let mut message = [0; MOST];
+    let Ok(message) = unseal(encoded, &mut message) else { return Heard::Damaged };
+    match postcard::take_from_bytes(message) {
+        Ok((request, _)) => Heard::Request(request),
+        Err(_) => match postcard::take_from_bytes::<u16>(message) {
+            Ok((id, _)) => Heard::Unreadable(id, why_unreadable(message)),
+            Err(_) => Heard::Damaged,
+        },
+    }
+}
+
+// The CRC is part of what is counted above.
+const _: () = assert!(MOST > MAX_REQUEST + CRC_LEN);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap::device::encode;
+    use cantap_wire::Command;
+
+    fn heard(bytes: &[u8], piece: usize) -> Vec<Heard> {
+        let mut inbox = Inbox::default();
+        let mut all = Vec::new();
+        bytes.chunks(piece).for_each(|bytes| inbox.push(bytes, |heard| all.push(heard)));
+        all
+    }
+
+    #[test]
+    fn requests_are_found_in_any_pieces_and_behind_anything() {
+        let request = |id| Request { id, command: Command::Time };
+        let bytes = [
+            b"GET / HTTP/1.1\r\n\r\n\0".to_vec(),
+            encode(&request(1)).unwrap(),
+            vec![0, 0],
+            vec![7; 100_000],
+            vec![0],
+            encode(&request(2)).unwrap(),
+        ]
+        .concat();
+        for piece in [1, 3, 1000, bytes.len()] {
+            let expected =
+                [Heard::Damaged, Heard::Request(request(1)), Heard::Damaged, Heard::Request(request(2))];
+            assert_eq!(heard(&bytes, piece), expected, "{piece}");
+        }
+    }
+
+    #[test]
+    fn a_command_that_does_not_exist_is_answered_as_malformed() {
+        let mut message = [5, 127, 0, 0, 0, 0];
+        let mut out = [0; 32];
+        let len = cantap_wire::framing::seal(&mut message, 2, &mut out).unwrap();
+        assert_eq!(heard(&out[..len], 32), [Heard::Unreadable(5, Refusal::Malformed)]);
+    }
+}

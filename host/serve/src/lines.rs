@@ -1,0 +1,89 @@
+//! candump's log lines over TCP, for `nc` and for SavvyCAN's log server: whoever connects hears, and says nothing.
+
+use std::io;
+use std::net::SocketAddr;
+use std::net::TcpStream;
+use std::sync::Arc;
+use std::time::Duration;
+
+use cantap::Device;
+use cantap::device::{Records, channel_number, is_idle, write_patiently};
+use cantap_wire::message::Role;
+use cantap_wire::{Channel, Refusal};
+
+use crate::listen::{Listening, accept, bind_loopback};
+use crate::{Board, News};
+
+/// Records that wait for one client at most, beside what waits in the server's queue.
+pub(crate) const HELD_RECORDS: usize = 1 << 16;
+/// A client that takes nothing for so long is gone.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// How long to wait for records before looking at the other board's.
+const WAIT: Duration = Duration::from_millis(10);
+
+/// Lets clients in at an address of this machine (loopback). They hear every channel of the boards whose bit rate is known, numbered on as
+/// everywhere.
+pub fn listen(boards: &[Arc<Board>], address: SocketAddr) -> io::Result<Listening> {
+    let (listener, address) = bind_loopback(address)?;
+    let boards = boards.to_vec();
+    Listening::start("cantap-lines", Some(address), move || {
+        let (stream, peer) = accept(&listener)?;
+        let boards = boards.clone();
+        std::thread::Builder::new().name("cantap-lines-client".to_owned()).spawn(move || {
+            let name = format!("line reader {peer}");
+            if let Err(reason) = serve(&boards, stream, &name) {
+                boards[0].tell(News::Refused { client: name, reason });
+            }
+        })?;
+        Ok(())
+    })
+}
+
+/// A device on a board of this process.
+pub(crate) fn device_of(board: &Board, name: &str, role: Role) -> Result<Device, String> {
+    let link = board.link(name, role).map_err(|refused| refused.to_string())?;
+    Device::over_holding(link, name, HELD_RECORDS).map_err(|error| error.to_string())
+}
+
+fn serve(boards: &[Arc<Board>], mut stream: TcpStream, name: &str) -> Result<(), String> {
+    let mut heard: Vec<(usize, Device, Records)> = Vec::new();
+    for (number, board) in boards.iter().enumerate() {
+        let device = device_of(board, name, Role::Listen)?;
+        for channel in Channel::ALL {
+            match device.open_channel(channel, None) {
+                // Nobody has said how fast its bus is.
+                Ok(_) | Err(cantap::DeviceError::Refused { refusal: Refusal::NothingSaved }) => {}
+                Err(error) => return Err(error.to_string()),
+            }
+        }
+        let records = device.records();
+        heard.push((number, device, records));
+    }
+    let mut out = String::new();
+    loop {
+        for (number, _, records) in &mut heard {
+            // The board or the server is gone: so is the connection.
+            let Ok(Some(batch)) = records.next_batch(WAIT) else { return Ok(()) };
+            for record in &batch {
+                let Some(channel) = Channel::from_number(record.channel) else { continue };
+                crate::text::put_line(&mut out, channel_number(*number, channel), record);
+            }
+        }
+        if out.is_empty() && is_closed(&stream) {
+            return Ok(());
+        }
+        if write_patiently(&mut stream, out.as_bytes(), PATIENCE).is_err() {
+            return Ok(());
+        }
+        out.clear();
+    }
+}
+
+/// Whether the other end has closed, as far as it shows without a word.
+fn is_closed(stream: &TcpStream) -> bool {
+    match stream.peek(&mut [0]) {
+        Ok(0) => true,
+        Ok(_) => false,
+        Err(error) => !is_idle(&error),
+    }
+}

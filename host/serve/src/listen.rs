@@ -1,0 +1,154 @@
+//! Where clients knock: sockets of this machine.
+
+use std::io::{self, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+#[cfg(unix)]
+use std::os::unix::net::{UnixListener, UnixStream};
+#[cfg(unix)]
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use cantap_wire::message::Role;
+
+use crate::connect::{SOCKET_TIMEOUT, prepare};
+use crate::{Board, News};
+
+/// How often to check whether somebody knocks.
+const LOOK_EVERY: Duration = Duration::from_millis(10);
+
+/// Lets clients in until it is dropped. Those who are in stay.
+pub struct Listening {
+    quit: Arc<AtomicBool>,
+    thread: Option<JoinHandle<()>>,
+    /// To be removed at the end.
+    #[cfg(unix)]
+    path: Option<PathBuf>,
+    address: Option<SocketAddr>,
+}
+
+impl Listening {
+    /// The address with the port that the system has chosen, of a TCP socket.
+    pub const fn address(&self) -> Option<SocketAddr> {
+        self.address
+    }
+
+    pub(crate) fn start(
+        name: &str,
+        address: Option<SocketAddr>,
+        mut accept: impl FnMut() -> io::Result<()> + Send + 'static,
+    ) -> io::Result<Self> {
+        let quit = Arc::new(AtomicBool::new(false));
+        let until = Arc::clone(&quit);
+        let thread = std::thread::Builder::new().name(name.to_owned()).spawn(move || {
+            while !until.load(Ordering::Relaxed) {
+                // Nobody is there, or one who has gone already, or the system has no room: later it may be otherwise.
+                if accept().is_err() {
+                    std::thread::sleep(LOOK_EVERY);
+                }
+            }
+        })?;
+        Ok(Self {
+            quit,
+            thread: Some(thread),
+            #[cfg(unix)]
+            path: None,
+            address,
+        })
+    }
+}
+
+impl Drop for Listening {
+    fn drop(&mut self) {
+        self.quit.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+        #[cfg(unix)]
+        if let Some(path) = &self.path {
+            let _ = std::fs::remove_file(path);
+        }
+    }
+}
+
+/// Lets clients in, of this user on this machine alone: nobody else can open the socket at `path`. One that a server has left behind is
+/// replaced; [`AddrInUse`](io::ErrorKind::AddrInUse) if a server is behind it.
+#[cfg(unix)]
+pub fn unix(board: &Arc<Board>, path: &Path, role: Role) -> io::Result<Listening> {
+    if path.exists() {
+        match UnixStream::connect(path) {
+            Err(error) if error.kind() == io::ErrorKind::ConnectionRefused => std::fs::remove_file(path)?,
+            _ => return Err(io::ErrorKind::AddrInUse.into()),
+        }
+    }
+    // From its first moment on: a mode that is set afterwards comes too late.
+    let before = rustix::process::umask(rustix::fs::Mode::from_raw_mode(0o177));
+    let bound = UnixListener::bind(path);
+    rustix::process::umask(before);
+    let listener = bound?;
+    listener.set_nonblocking(true)?;
+    let board = Arc::clone(board);
+    let mut count = 0;
+    let mut listening = Listening::start("cantap-unix", None, move || {
+        let (stream, _) = listener.accept()?;
+        count += 1;
+        stream.set_nonblocking(false)?;
+        stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
+        stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
+        let output = stream.try_clone()?;
+        admit(&board, stream, output, &format!("local client {count}"), role);
+        Ok(())
+    })?;
+    listening.path = Some(path.to_owned());
+    Ok(listening)
+}
+
+/// Lets clients in, without encryption and without asking who they are: `address` must be one of this machine's own
+/// (loopback), which every user of it can reach; [`PermissionDenied`](io::ErrorKind::PermissionDenied) for any other.
+pub fn tcp(board: &Arc<Board>, address: SocketAddr, role: Role) -> io::Result<Listening> {
+    let (listener, address) = bind_loopback(address)?;
+    let board = Arc::clone(board);
+    Listening::start("cantap-tcp", Some(address), move || {
+        let (stream, peer) = accept(&listener)?;
+        let output = stream.try_clone()?;
+        admit(&board, stream, output, &format!("client {peer}"), role);
+        Ok(())
+    })
+}
+
+/// A socket that only this machine reaches.
+pub(crate) fn bind_loopback(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
+    if !address.ip().is_loopback() {
+        return Err(io::ErrorKind::PermissionDenied.into());
+    }
+    bind(address)
+}
+
+pub(crate) fn bind(address: SocketAddr) -> io::Result<(TcpListener, SocketAddr)> {
+    let listener = TcpListener::bind(address)?;
+    listener.set_nonblocking(true)?;
+    let address = listener.local_addr()?;
+    Ok((listener, address))
+}
+
+pub(crate) fn accept(listener: &TcpListener) -> io::Result<(TcpStream, SocketAddr)> {
+    let (stream, peer) = listener.accept()?;
+    stream.set_nonblocking(false)?;
+    prepare(&stream)?;
+    Ok((stream, peer))
+}
+
+/// Lets one in, or tells that it was not.
+pub(crate) fn admit(
+    board: &Board,
+    input: impl Read + Send + 'static,
+    output: impl Write + Send + 'static,
+    name: &str,
+    role: Role,
+) {
+    if let Err(refused) = board.admit(input, output, name, role) {
+        board.tell(News::Refused { client: name.to_owned(), reason: refused.to_string() });
+    }
+}

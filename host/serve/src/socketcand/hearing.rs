@@ -1,0 +1,181 @@
+//! Which records one client is told, and what it counts.
+
+use std::collections::HashMap;
+use std::fmt::Write;
+use std::time::{Duration, Instant};
+
+use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap_wire::{Frame, Id};
+
+use super::subscriptions::Subscriptions;
+use super::told::{put_error, put_frame};
+
+/// What a client hears, by its mode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Hears {
+    /// In BCM mode, which every bus is opened in.
+    #[default]
+    Subscribed,
+    /// In raw mode.
+    All,
+    /// In control mode.
+    Nothing,
+}
+
+/// What a client hears.
+#[derive(Default)]
+pub struct Hearing {
+    pub hears: Hears,
+    /// Not before.
+    from: Option<Instant>,
+    pub subscriptions: Subscriptions,
+    /// What it has sent, by tag, until it is on the bus: a client does not hear itself.
+    pub own_frames: HashMap<u32, Frame>,
+    /// What is sent for it again and again.
+    pub own_entries: HashMap<Id, Frame>,
+    /// It was off the bus for a moment.
+    pub has_gap: bool,
+    statistics: Statistics,
+}
+
+#[derive(Default)]
+struct Statistics {
+    every: Duration,
+    told_at: Option<Instant>,
+    received_bytes: u64,
+    received: u64,
+    sent_bytes: u64,
+    sent: u64,
+}
+
+impl Hearing {
+    /// Changes the mode. What was subscribed to in BCM mode is over with it.
+    pub fn begin(&mut self, hears: Hears, from: Instant) {
+        self.hears = hears;
+        self.from = Some(from);
+        self.subscriptions.clear();
+    }
+
+    /// Tells statistics so often from now on; never, if it is zero.
+    pub fn statistics_every(&mut self, every: Duration) {
+        self.statistics.every = every;
+        self.statistics.told_at = Some(Instant::now());
+    }
+
+    /// How long nothing may be told.
+    pub fn wait(&self) -> Option<Duration> {
+        let wait = self.from?.saturating_duration_since(Instant::now());
+        (!wait.is_zero()).then_some(wait)
+    }
+
+    /// Takes records, and adds what the client is told.
+    pub fn take(&mut self, records: &[TraceRecord], out: &mut String) {
+        for record in records {
+            if std::mem::take(&mut self.has_gap) && self.hears != Hears::Nothing {
+                put_error(out, record.time_ns, &TraceEvent::GAP);
+            }
+            self.take_one(record, out);
+        }
+        self.put_statistics(out);
+    }
+
+    fn take_one(&mut self, record: &TraceRecord, out: &mut String) {
+        let time_ns = record.time_ns;
+        for (time_ns, frame) in self.subscriptions.ripe(time_ns) {
+            put_frame(out, time_ns, &frame, false);
+        }
+        match &record.event {
+            TraceEvent::Frame { frame, direction, .. } => {
+                let Some(frame) = frame.classic() else { return };
+                let bytes = frame.data().len() as u64;
+                if *direction == Direction::Tx && self.is_own(frame) {
+                    self.statistics.sent += 1;
+                    self.statistics.sent_bytes += bytes;
+                    return;
+                }
+                self.statistics.received += 1;
+                self.statistics.received_bytes += bytes;
+                match self.hears {
+                    Hears::All => put_frame(out, time_ns, frame, true),
+                    Hears::Subscribed => {
+                        if let Some((time_ns, frame)) = self.subscriptions.take(time_ns, frame) {
+                            put_frame(out, time_ns, &frame, false);
+                        }
+                    }
+                    Hears::Nothing => {}
+                }
+            }
+            event => {
+                if let TraceEvent::TransmitFailed { tag, .. } = event {
+                    self.own_frames.remove(tag);
+                }
+                if self.hears != Hears::Nothing {
+                    put_error(out, time_ns, event);
+                }
+            }
+        }
+    }
+
+    /// Whether the client has sent a frame itself, which is then over.
+    fn is_own(&mut self, frame: &Frame) -> bool {
+        if self.own_entries.get(&frame.id()) == Some(frame) {
+            return true;
+        }
+        let tag = self.own_frames.iter().find(|(_, own)| *own == frame).map(|(tag, _)| *tag);
+        tag.is_some_and(|tag| self.own_frames.remove(&tag).is_some())
+    }
+
+    fn put_statistics(&mut self, out: &mut String) {
+        let Statistics { every, told_at, received_bytes, received, sent_bytes, sent } = &mut self.statistics;
+        if every.is_zero() || told_at.is_some_and(|told_at| told_at.elapsed() < *every) {
+            return;
+        }
+        *told_at = Some(Instant::now());
+        // Writing to memory cannot fail.
+        let _ = write!(out, "< stat {received_bytes} {received} {sent_bytes} {sent} >");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn record(ms: i64, frame: &str, direction: Direction) -> TraceRecord {
+        let frame = frame.parse::<Frame>().unwrap().into();
+        TraceRecord {
+            time_ns: ms * 1_000_000,
+            channel: 1,
+            event: TraceEvent::Frame { frame, direction, late: false },
+        }
+    }
+
+    #[test]
+    fn a_client_hears_others_frames_and_not_its_own() {
+        let mut hearing = Hearing { hears: Hears::All, ..Hearing::default() };
+        hearing.own_frames.insert(1, "123#11".parse().unwrap());
+        hearing.own_entries.insert(Id::standard(0x200).unwrap(), "200#".parse().unwrap());
+        let mut out = String::new();
+        let sent = |ms, frame| record(ms, frame, Direction::Tx);
+        let records =
+            [sent(1, "123#11"), sent(2, "123#11"), sent(3, "200#"), record(4, "200#", Direction::Rx)];
+        hearing.take(&records, &mut out);
+        assert_eq!(out, "< frame 123 0.002000 11 >< frame 200 0.004000  >");
+    }
+
+    #[test]
+    fn statistics_count_both_directions_and_modes_tell_what_they_are_for() {
+        let mut hearing = Hearing::default();
+        let mut out = String::new();
+        hearing.begin(Hears::Nothing, Instant::now());
+        hearing.statistics_every(Duration::from_nanos(1));
+        hearing.own_frames.insert(1, "123#11".parse().unwrap());
+        hearing.take(&[record(1, "123#11", Direction::Tx), record(2, "124#2233", Direction::Rx)], &mut out);
+        assert_eq!(out, "< stat 2 1 1 1 >");
+        out.clear();
+        hearing.statistics_every(Duration::ZERO);
+        hearing.begin(Hears::Subscribed, Instant::now());
+        hearing.subscriptions.add(Id::standard(0x124).unwrap(), super::super::subscriptions::Wanted::All, 0);
+        hearing.take(&[record(3, "123#11", Direction::Rx), record(4, "124#2233", Direction::Rx)], &mut out);
+        assert_eq!(out, "< frame 124 0.004000 22 33  >");
+    }
+}

@@ -1,0 +1,460 @@
+//! The socketcand protocol (<https://github.com/linux-can/socketcand>, doc/protocol.md), for SavvyCAN, Kayak, python-can and
+//! whatever else speaks it: raw, BCM and control mode, and the beacon. ISO-TP mode is not there.
+//!
+//! The page leaves some things open, and clients differ: [`told`] says how frames are written, [`command`] how they are read. The bus is only
+//! listened to until a client that may send does so; its frames then come back to the others, and not to itself. What is sent again and
+//! again (`add`) the board sends, at its own clock's times.
+
+mod command;
+mod hearing;
+mod subscriptions;
+mod told;
+
+use std::collections::HashMap;
+use std::io::{self, Read};
+use std::net::{Ipv4Addr, SocketAddr, TcpStream, UdpSocket};
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use cantap::device::{channel_number, is_idle, write_patiently};
+use cantap::{Device, DeviceError};
+use cantap_trace::Interface;
+use cantap_wire::message::{ChannelConfig, Mode, Periodic, Role, TxFrame};
+use cantap_wire::{Channel, Frame, Id};
+
+use crate::lines::device_of;
+use crate::listen::{Listening, accept, bind};
+use crate::{Board, News};
+use command::{BadCommand, Command, Finder};
+use hearing::{Hearing, Hears};
+use subscriptions::{MOST, Wanted};
+
+/// The port of the server of that name.
+pub const PORT: u16 = 29_536;
+/// Where beacons are listened for.
+const BEACON_PORT: u16 = 42_000;
+/// At least every three seconds, the page says.
+const BEACON_EVERY: Duration = Duration::from_secs(2);
+/// Clients compare what one read returns with one answer, so two are not sent at once.
+const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
+/// And no frame right behind the answer to `rawmode`.
+const BEFORE_FRAMES: Duration = Duration::from_millis(100);
+/// A client that has not opened a bus by then is let go.
+const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
+/// A client that takes nothing for so long is gone.
+const PATIENCE: Duration = Duration::from_secs(30);
+/// Connections at a time, those that have not opened a bus among them.
+const MOST_CONNECTIONS: usize = 32;
+
+/// Lets clients in. The buses are the boards' channels, `can0` the first board's first, as in every trace. There is no authentication in the
+/// protocol: at an address that is not this machine's own (loopback) clients may only listen.
+pub fn listen(boards: &[Arc<Board>], address: SocketAddr, role: Role) -> io::Result<Listening> {
+    let role = if address.ip().is_loopback() { role } else { Role::Listen };
+    let (listener, address) = bind(address)?;
+    let buses: Arc<[Bus]> = boards
+        .iter()
+        .enumerate()
+        .flat_map(|(number, board)| {
+            Channel::ALL.map(|channel| Bus {
+                name: Interface(channel_number(number, channel)).to_string(),
+                board: Arc::clone(board),
+                channel,
+            })
+        })
+        .collect();
+    let beacon = Beacon::new(address, &buses)?;
+    let mut sent: Option<Instant> = None;
+    let connections = Arc::new(());
+    Listening::start("cantap-socketcand", Some(address), move || {
+        if sent.is_none_or(|sent| sent.elapsed() >= BEACON_EVERY) {
+            beacon.send();
+            sent = Some(Instant::now());
+        }
+        let (stream, peer) = accept(&listener)?;
+        let name = format!("socketcand client {peer}");
+        if Arc::strong_count(&connections) > MOST_CONNECTIONS {
+            let reason = format!("there are {MOST_CONNECTIONS} connections already");
+            buses[0].board.tell(News::Refused { client: name, reason });
+            return Ok(());
+        }
+        let (buses, counted) = (Arc::clone(&buses), Arc::clone(&connections));
+        std::thread::Builder::new().name("cantap-socketcand-client".to_owned()).spawn(move || {
+            if let Ok(connection) = Connection::new(stream, name, buses, role) {
+                // An error is a connection that is gone.
+                let _ = connection.serve();
+            }
+            drop(counted);
+        })?;
+        Ok(())
+    })
+}
+
+/// A channel that can be opened.
+struct Bus {
+    name: String,
+    board: Arc<Board>,
+    channel: Channel,
+}
+
+/// Says where the server is.
+struct Beacon {
+    socket: UdpSocket,
+    to: SocketAddr,
+    text: String,
+}
+
+impl Beacon {
+    fn new(address: SocketAddr, buses: &[Bus]) -> io::Result<Self> {
+        let is_local = address.ip().is_loopback();
+        let (from, to) = if is_local {
+            (Ipv4Addr::LOCALHOST, Ipv4Addr::LOCALHOST)
+        } else {
+            (Ipv4Addr::UNSPECIFIED, Ipv4Addr::BROADCAST)
+        };
+        let socket = UdpSocket::bind((from, 0))?;
+        socket.set_broadcast(!is_local)?;
+        let buses: Vec<String> = buses.iter().map(|bus| format!("<Bus name=\"{}\"/>", bus.name)).collect();
+        let buses = buses.concat();
+        let text = format!(
+            "<CANBeacon name=\"cantap\" type=\"adapter\" description=\"cantap CAN analyser\"><URL>can://{address}</URL>{buses}</CANBeacon>"
+        );
+        Ok(Self { socket, to: (to, BEACON_PORT).into(), text })
+    }
+
+    fn send(&self) {
+        // Nobody may be listening.
+        let _ = self.socket.send_to(self.text.as_bytes(), self.to);
+    }
+}
+
+/// One client.
+struct Connection {
+    input: Mutex<TcpStream>,
+    output: Mutex<TcpStream>,
+    name: String,
+    buses: Arc<[Bus]>,
+    role: Role,
+    hearing: Mutex<Hearing>,
+    is_over: AtomicBool,
+}
+
+/// What a client has chosen before it opens a bus.
+#[derive(Default)]
+struct Setup {
+    bitrates_bps: HashMap<String, u32>,
+    listen_only: bool,
+    loopback: bool,
+}
+
+/// A bus that is open.
+struct Opened {
+    device: Arc<Device>,
+    channel: Channel,
+    config: ChannelConfig,
+    /// In which mode it is sent, if it may be.
+    sends_in: Option<Mode>,
+    next_tag: u32,
+    /// What is sent again and again, by entry.
+    periodic: HashMap<Id, (u8, u64)>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every holder leaves the state whole.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Connection {
+    fn new(stream: TcpStream, name: String, buses: Arc<[Bus]>, role: Role) -> io::Result<Arc<Self>> {
+        let output = Mutex::new(stream.try_clone()?);
+        Ok(Arc::new(Self {
+            input: Mutex::new(stream),
+            output,
+            name,
+            buses,
+            role,
+            hearing: Mutex::default(),
+            is_over: AtomicBool::new(false),
+        }))
+    }
+
+    /// Does what the client says until either side ends.
+    fn serve(self: &Arc<Self>) -> io::Result<()> {
+        self.write("< hi >")?;
+        let mut finder = Finder::default();
+        let (mut setup, mut opened) = (Setup::default(), None);
+        let mut answered_at = Instant::now();
+        let came = Instant::now();
+        let mut bytes = [0; 4096];
+        let mut result = Ok(());
+        while result.is_ok() && !self.is_over.load(Ordering::Relaxed) {
+            let len = match lock(&self.input).read(&mut bytes) {
+                Ok(0) => break,
+                Ok(len) => len,
+                Err(error) if is_idle(&error) => 0,
+                Err(error) => {
+                    result = Err(error);
+                    break;
+                }
+            };
+            finder.push(&bytes[..len], |text| {
+                if result.is_err() {
+                    return;
+                }
+                let answer = match command::parse(text) {
+                    Ok(command) => self.perform(command, &mut setup, &mut opened),
+                    Err(BadCommand::Unknown) => Some("< error unknown command >".to_owned()),
+                    Err(BadCommand::Syntax(what)) => {
+                        Some(format!("< error {what} is wrong in '{}' >", plain(text.trim())))
+                    }
+                };
+                if let Some(answer) = answer {
+                    std::thread::sleep(BETWEEN_ANSWERS.saturating_sub(answered_at.elapsed()));
+                    result = self.write(&answer);
+                    answered_at = Instant::now();
+                }
+            });
+            if opened.is_none() && came.elapsed() > OPEN_TIMEOUT {
+                break;
+            }
+        }
+        self.is_over.store(true, Ordering::Relaxed);
+        result
+    }
+
+    fn write(&self, text: &str) -> io::Result<()> {
+        write_patiently(&mut *lock(&self.output), text.as_bytes(), PATIENCE)
+    }
+
+    /// Does one thing. Returns what there is to say.
+    fn perform(
+        self: &Arc<Self>,
+        command: Command,
+        setup: &mut Setup,
+        opened: &mut Option<Opened>,
+    ) -> Option<String> {
+        let ok = || Some("< ok >".to_owned());
+        let Some(bus) = opened else {
+            return match command {
+                Command::Open(name) => match self.open(&name, setup) {
+                    Ok(bus) => {
+                        *opened = Some(bus);
+                        ok()
+                    }
+                    Err(reason) => {
+                        self.refused(&reason);
+                        // As the page has it: the connection ends.
+                        self.is_over.store(true, Ordering::Relaxed);
+                        Some("< error could not open bus >".to_owned())
+                    }
+                },
+                Command::Bitrate(name, rate) => {
+                    setup.bitrates_bps.insert(name, rate);
+                    ok()
+                }
+                Command::ControlMode { triple: true, .. } => {
+                    Some("< error this controller samples each bit once >".to_owned())
+                }
+                Command::ControlMode { listen_only, loopback, .. } => {
+                    (setup.listen_only, setup.loopback) = (listen_only, loopback);
+                    ok()
+                }
+                Command::Echo => Some("< echo >".to_owned()),
+                _ => Some("< error open a bus first >".to_owned()),
+            };
+        };
+        let done = match command {
+            Command::Open(_) | Command::Bitrate(..) | Command::ControlMode { .. } => {
+                return Some("< error a bus is open already >".to_owned());
+            }
+            Command::RawMode => {
+                lock(&self.hearing).begin(Hears::All, Instant::now() + BEFORE_FRAMES);
+                return ok();
+            }
+            Command::BcmMode => {
+                lock(&self.hearing).begin(Hears::Subscribed, Instant::now());
+                return ok();
+            }
+            Command::StatisticsMode => {
+                lock(&self.hearing).begin(Hears::Nothing, Instant::now());
+                return ok();
+            }
+            Command::Echo => return Some("< echo >".to_owned()),
+            Command::Statistics(ms) => {
+                lock(&self.hearing).statistics_every(Duration::from_millis(ms));
+                return None;
+            }
+            Command::Subscribe(us, id) => self.subscribe(id, Wanted::All, us),
+            Command::Filter(us, id, mask) => self.subscribe(
+                id,
+                Wanted::Changes(std::array::from_fn(|at| mask.get(at).copied().unwrap_or(0))),
+                us,
+            ),
+            Command::MuxFilter(us, id, mut tuples) => {
+                let selector = tuples.remove(0);
+                self.subscribe(id, Wanted::Multiplexed(selector, tuples), us)
+            }
+            Command::Unsubscribe(id) => {
+                lock(&self.hearing).subscriptions.remove(id);
+                Ok(())
+            }
+            Command::Send(frame) => self.send(bus, frame),
+            Command::Add(us, frame) => self.add(bus, us, frame),
+            Command::Update(frame) => match bus.periodic.get(&frame.id()) {
+                Some((_, us)) => {
+                    let us = *us;
+                    self.add(bus, us, frame)
+                }
+                None => Err(format!("nothing is sent again and again as {}", frame.id())),
+            },
+            Command::Delete(id) => match bus.periodic.remove(&id) {
+                Some((slot, _)) => {
+                    lock(&self.hearing).own_entries.remove(&id);
+                    bus.device.set_periodic(bus.channel, slot, None).map_err(|error| error.to_string())
+                }
+                None => Err(format!("nothing is sent again and again as {id}")),
+            },
+        };
+        let reason = done.err()?;
+        self.refused(&reason);
+        // In raw mode clients read frames alone.
+        if lock(&self.hearing).hears == Hears::All {
+            return Some(told::not_sent());
+        }
+        Some(format!("< error {} >", plain(&reason)))
+    }
+
+    fn refused(&self, reason: &str) {
+        self.buses[0].board.tell(News::Refused { client: self.name.clone(), reason: reason.to_owned() });
+    }
+
+    fn open(self: &Arc<Self>, name: &str, setup: &Setup) -> Result<Opened, String> {
+        let bus = self
+            .buses
+            .iter()
+            .find(|bus| bus.name == name)
+            .ok_or_else(|| format!("there is no bus '{}'", plain(name)))?;
+        let device = device_of(&bus.board, &self.name, self.role)?;
+        let channel = bus.channel;
+        let config = match setup.bitrates_bps.get(name) {
+            Some(rate) => device.listen(channel, *rate),
+            None => device.open_channel(channel, None),
+        };
+        let config = config.map_err(|error| error.to_string())?;
+        let sends_in = match (setup.listen_only, setup.loopback) {
+            (true, _) => None,
+            (false, true) => Some(Mode::Loopback),
+            (false, false) => Some(Mode::Normal),
+        };
+        let device = Arc::new(device);
+        let (connection, heard) = (Arc::clone(self), Arc::clone(&device));
+        std::thread::Builder::new()
+            .name("cantap-socketcand-hears".to_owned())
+            .spawn(move || connection.hear(&heard))
+            .map_err(|error| error.to_string())?;
+        Ok(Opened { device, channel, config, sends_in, next_tag: 0, periodic: HashMap::new() })
+    }
+
+    /// Tells the client what is heard, until either side ends.
+    fn hear(&self, device: &Device) {
+        let mut records = device.records();
+        let mut out = String::new();
+        while !self.is_over.load(Ordering::Relaxed) {
+            // The board or the server is gone: so is the connection.
+            let Ok(Some(batch)) = records.next_batch(Duration::from_millis(20)) else { break };
+            loop {
+                let mut hearing = lock(&self.hearing);
+                let Some(wait) = hearing.wait() else {
+                    hearing.take(&batch, &mut out);
+                    break;
+                };
+                drop(hearing);
+                std::thread::sleep(wait);
+            }
+            records.recycle(batch);
+            if self.write(&out).is_err() {
+                break;
+            }
+            out.clear();
+        }
+        self.is_over.store(true, Ordering::Relaxed);
+    }
+
+    fn subscribe(&self, id: Id, wanted: Wanted, interval_us: u64) -> Result<(), String> {
+        if lock(&self.hearing).subscriptions.add(id, wanted, interval_us) {
+            Ok(())
+        } else {
+            Err(format!("{MOST} identifiers are subscribed to, which is the most"))
+        }
+    }
+
+    /// Opens the bus for sending, which a client that sends asks for.
+    fn may_send(&self, bus: &mut Opened) -> Result<(), String> {
+        let Some(mode) = bus.sends_in else { return Err("the bus was opened to listen only".to_owned()) };
+        if bus.config.mode == mode {
+            return Ok(());
+        }
+        let said = |error: DeviceError| error.to_string();
+        let config = ChannelConfig { mode, ..bus.config };
+        bus.device.close_channel(bus.channel).map_err(said)?;
+        let opened = bus.device.open_channel(bus.channel, Some(config));
+        if opened.is_err() {
+            bus.device.open_channel(bus.channel, Some(bus.config)).map_err(said)?;
+        }
+        // What was on the bus meanwhile the client has not heard.
+        lock(&self.hearing).has_gap = true;
+        bus.config = opened.map_err(said)?;
+        Ok(())
+    }
+
+    fn send(&self, bus: &mut Opened, frame: Frame) -> Result<(), String> {
+        self.may_send(bus)?;
+        let tag = bus.next_tag;
+        bus.next_tag = (tag + 1) % (1 << 24);
+        lock(&self.hearing).own_frames.insert(tag, frame);
+        let sent = bus.device.send(bus.channel, &[TxFrame { tag, frame, at_ticks: None }]);
+        if let Err(error) = sent {
+            lock(&self.hearing).own_frames.remove(&tag);
+            return Err(error.to_string());
+        }
+        Ok(())
+    }
+
+    /// Has the board send a frame again and again; one of the same identifier is replaced.
+    fn add(&self, bus: &mut Opened, us: u64, frame: Frame) -> Result<(), String> {
+        self.may_send(bus)?;
+        let hello = bus.device.hello();
+        let ticks = u128::from(us) * u128::from(hello.tick_hz) / 1_000_000;
+        let period_ticks = u32::try_from(ticks).map_err(|_| {
+            format!(
+                "the board's longest period is {} s",
+                u64::from(u32::MAX) / u64::from(hello.tick_hz.max(1))
+            )
+        })?;
+        let slot = match bus.periodic.get(&frame.id()) {
+            Some((slot, _)) => *slot,
+            None => (0..hello.periodic_slots)
+                .find(|slot| bus.periodic.values().all(|(taken, _)| taken != slot))
+                .ok_or_else(|| {
+                    format!("the board sends {} frames again and again at most", hello.periodic_slots)
+                })?,
+        };
+        let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };
+        let before = lock(&self.hearing).own_entries.insert(frame.id(), frame);
+        if let Err(error) = bus.device.set_periodic(bus.channel, slot, Some(entry)) {
+            let entries = &mut lock(&self.hearing).own_entries;
+            match before {
+                Some(before) => entries.insert(frame.id(), before),
+                None => entries.remove(&frame.id()),
+            };
+            return Err(error.to_string());
+        }
+        bus.periodic.insert(frame.id(), (slot, us));
+        Ok(())
+    }
+}
+
+/// Nothing that a client could take for the end of an answer.
+fn plain(text: &str) -> String {
+    text.chars().filter(|letter| !matches!(letter, '<' | '>') && !letter.is_control()).take(200).collect()
+}

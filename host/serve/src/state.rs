@@ -1,0 +1,351 @@
+//! What a server knows of its board and of those who share it. One lock is around it, which nobody holds while waiting for
+//! anything.
+
+use std::collections::{BTreeMap, HashMap};
+use std::sync::Arc;
+use std::sync::mpsc::SyncSender;
+
+use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Mode, Role, TRIGGER_TAG, TxFrame};
+use cantap_wire::record::{ErrorState, LossStage, Record, TransmitFailure};
+use cantap_wire::{CHANNELS, Channel, Command, Event, Hello, Refusal, Reply};
+
+use crate::outbox::{Item, Outbox};
+use crate::stream::{ClientId, Counts, Entry, Owner, Views};
+
+/// Tags of a board's queue are counted up to here: far below the board's own, far above what is under way.
+const TAGS: u32 = 1 << 30;
+
+/// One client.
+pub struct Member {
+    pub role: Role,
+    pub outbox: Arc<Outbox>,
+    /// It has greeted, and the session is not over.
+    pub in_session: bool,
+    pub views: Views,
+    pub counts: [Counts; CHANNELS],
+}
+
+/// A frame in the board's queue, or in a mailbox.
+pub struct Sent {
+    pub client: ClientId,
+    /// As the client calls it.
+    pub frame: TxFrame,
+    pub channel: Channel,
+    /// Another client's frames are being withdrawn: this one is sent again.
+    pub keep: bool,
+    /// The client has closed the channel, which is how its end is told.
+    pub is_closed: bool,
+}
+
+/// What happens when an answer is there, in the order of the stream.
+pub enum Then {
+    /// Nothing.
+    Nothing,
+    /// The channel is open on the board; it becomes this client's, if it is one's.
+    Opened { client: Option<(ClientId, ChannelConfig)>, channel: Channel },
+    /// A frame was sent again.
+    SentAgain(u32),
+}
+
+/// A question to the board.
+pub struct Asked {
+    pub answer: SyncSender<Result<Reply, Refusal>>,
+    pub then: Then,
+}
+
+/// Which table of a board.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Table {
+    Periodic,
+    Triggers,
+}
+
+impl Table {
+    /// The first tag of its entries.
+    const fn tag(self) -> u32 {
+        match self {
+            Self::Periodic => DEVICE_TAG,
+            Self::Triggers => TRIGGER_TAG,
+        }
+    }
+}
+
+/// Who has which entries of the board's tables on one channel, and by which numbers they know them.
+#[derive(Default)]
+pub struct Entries {
+    periodic: BTreeMap<u8, (ClientId, u8)>,
+    triggers: BTreeMap<u8, (ClientId, u8)>,
+}
+
+impl Entries {
+    fn table(&mut self, table: Table) -> &mut BTreeMap<u8, (ClientId, u8)> {
+        match table {
+            Table::Periodic => &mut self.periodic,
+            Table::Triggers => &mut self.triggers,
+        }
+    }
+
+    /// The board's entry that is a client's, if it has one.
+    pub fn find(&mut self, table: Table, client: ClientId, slot: u8) -> Option<u8> {
+        self.table(table).iter().find(|(_, owner)| **owner == (client, slot)).map(|(entry, _)| *entry)
+    }
+
+    /// The same, or a free one.
+    pub fn take(&mut self, table: Table, client: ClientId, slot: u8, slots: u8) -> Option<u8> {
+        let found = self.find(table, client, slot);
+        let table = self.table(table);
+        // Each client's own number where it is free, so that one alone finds the board's tables as they are.
+        let entry = found
+            .or_else(|| std::iter::once(slot).chain(0..slots).find(|entry| !table.contains_key(entry)))?;
+        table.insert(entry, (client, slot));
+        Some(entry)
+    }
+
+    pub fn free(&mut self, table: Table, entry: u8) {
+        self.table(table).remove(&entry);
+    }
+
+    /// Every entry of a client.
+    pub fn of(&mut self, client: ClientId) -> Vec<(Table, u8)> {
+        let mut all = Vec::new();
+        for table in [Table::Periodic, Table::Triggers] {
+            let owned = self.table(table).iter().filter(|(_, (owner, _))| *owner == client);
+            all.extend(owned.map(|(entry, _)| (table, *entry)));
+        }
+        all
+    }
+
+    /// Whose a tag of the board's own is, and what it is called there.
+    fn owner(&self, tag: u32) -> Option<Owner> {
+        let (table, entries) = if tag >= TRIGGER_TAG {
+            (Table::Triggers, &self.triggers)
+        } else {
+            (Table::Periodic, &self.periodic)
+        };
+        let (client, slot) = entries.get(&u8::try_from(tag - table.tag()).ok()?)?;
+        Some(Owner { client: *client, tag: table.tag() + u32::from(*slot) })
+    }
+
+    pub fn clear(&mut self) {
+        *self = Self::default();
+    }
+}
+
+/// All of it.
+#[derive(Default)]
+pub struct State {
+    /// The board, while it is there.
+    pub hello: Option<Hello>,
+    /// How each channel is opened unless somebody may say otherwise and does.
+    pub base: [Option<ChannelConfig>; CHANNELS],
+    /// How each channel is open on the board.
+    pub open: [Option<ChannelConfig>; CHANNELS],
+    controller: [Option<(ErrorState, u8, u8)>; CHANNELS],
+    /// Device time of the latest record.
+    pub latest_ticks: u64,
+    /// Times each channel has stopped.
+    pub stopped: [u32; CHANNELS],
+    pub clients: BTreeMap<ClientId, Member>,
+    /// Who configures.
+    pub holder: Option<ClientId>,
+    pub sent: HashMap<u32, Sent>,
+    next_tag: u32,
+    pub entries: [Entries; CHANNELS],
+    pub asked: HashMap<u16, Asked>,
+    next_request: u16,
+    /// Frames to be sent once more, with their channel, when the lock is free.
+    pub again: Vec<(Channel, TxFrame)>,
+    /// The board is to be let go.
+    pub must_end: bool,
+    /// Clients that are written to.
+    pub writers: usize,
+    /// The server ends: nobody else is let in.
+    pub is_over: bool,
+}
+
+impl State {
+    /// Notes a question. Returns its number.
+    pub fn ask(&mut self, asked: Asked) -> u16 {
+        let id = self.next_request;
+        self.next_request = id.wrapping_add(1);
+        self.asked.insert(id, asked);
+        id
+    }
+
+    /// Notes a frame that is going to the board. Returns its tag there.
+    pub fn note_sent(&mut self, client: ClientId, channel: Channel, frame: TxFrame) -> u32 {
+        let tag = self.next_tag;
+        self.next_tag = (tag + 1) % TAGS;
+        self.sent.insert(tag, Sent { client, frame, channel, keep: false, is_closed: false });
+        tag
+    }
+
+    /// Frames of a client that are under way on a channel.
+    pub fn under_way(&self, client: ClientId, channel: Channel) -> usize {
+        self.sent.values().filter(|sent| sent.client == client && sent.channel == channel).count()
+    }
+
+    /// Whether another client than this one has a channel open, and whether one of them may send on it.
+    pub fn others_on(&self, client: ClientId, channel: Channel) -> (bool, bool) {
+        let others = self.clients.iter().filter(|(id, _)| **id != client);
+        others
+            .map(|(_, member)| &member.views[channel.index()])
+            .fold((false, false), |(any, senders), view| {
+                (any || view.config.is_some(), senders || view.transmits())
+            })
+    }
+
+    /// Gives a client the right to configure, if it may have it.
+    pub fn hold(&mut self, client: ClientId) -> Result<(), Refusal> {
+        let role = self.clients.get(&client).map_or(Role::Listen, |member| member.role);
+        if role < Role::Configure {
+            return Err(Refusal::NotGranted { needs: Role::Configure });
+        }
+        match self.holder {
+            Some(holder) if holder != client => Err(Refusal::Held),
+            _ => {
+                self.holder = Some(client);
+                Ok(())
+            }
+        }
+    }
+
+    /// Takes a record of the board. Returns how it goes on to the clients, if it does.
+    pub fn take(&mut self, ticks: u64, record: Record) -> Option<Entry> {
+        // Stamps can be computed back to before an earlier record.
+        self.latest_ticks = self.latest_ticks.max(ticks);
+        let mut entry = Entry { ticks, record, owner: None };
+        let Record::Event(event) = record else { return Some(entry) };
+        match event {
+            Event::Started { .. } => return None,
+            Event::Stopped { channel } => {
+                self.stopped[channel.index()] += 1;
+                return None;
+            }
+            Event::State { channel, state, tec, rec } => {
+                self.controller[channel.index()] = Some((state, tec, rec));
+            }
+            Event::Transmitted { tag, channel, .. } => {
+                entry.owner = match self.sent.remove(&tag) {
+                    Some(sent) => Some(Owner { client: sent.client, tag: sent.frame.tag }),
+                    None => self.entries[channel.index()].owner_of_own(tag),
+                };
+            }
+            Event::TransmitFailed { channel, tag, reason } => match self.sent.remove(&tag) {
+                Some(sent) if sent.keep && reason == TransmitFailure::Aborted => {
+                    let client = sent.client;
+                    let again = self.note_sent(client, channel, sent.frame);
+                    self.again.push((channel, TxFrame { tag: again, ..sent.frame }));
+                    return None;
+                }
+                Some(sent) => {
+                    entry.owner = Some(Owner { client: sent.client, tag: sent.frame.tag });
+                    let reason = if sent.is_closed { TransmitFailure::Closed } else { reason };
+                    entry.record = Record::Event(Event::TransmitFailed { channel, tag, reason });
+                }
+                None => entry.owner = self.entries[channel.index()].owner_of_own(tag),
+            },
+            _ => {}
+        }
+        Some(entry)
+    }
+
+    /// A frame that was to be sent again was not taken.
+    pub fn give_up(&mut self, tag: u32) -> Option<Entry> {
+        let Sent { client, frame, channel, is_closed, .. } = self.sent.remove(&tag)?;
+        let reason = if is_closed { TransmitFailure::Closed } else { TransmitFailure::Aborted };
+        let mut entry =
+            Entry::event(self.latest_ticks, Event::TransmitFailed { channel, tag: frame.tag, reason });
+        entry.owner = Some(Owner { client, tag: frame.tag });
+        Some(entry)
+    }
+
+    /// Hands records to every client. Nobody waits.
+    pub fn deliver(&mut self, chunk: &mut Vec<Entry>) {
+        if chunk.is_empty() {
+            return;
+        }
+        let chunk = std::mem::take(chunk).into();
+        for (id, member) in &mut self.clients {
+            if member.in_session {
+                member.outbox.offer(&chunk, *id, &member.views, &mut member.counts);
+            }
+        }
+    }
+
+    /// The board has opened a channel.
+    pub fn opened(&mut self, channel: Channel, config: ChannelConfig) {
+        self.open[channel.index()] = Some(config);
+        self.controller[channel.index()] = None;
+        self.entries[channel.index()].clear();
+        // Whoever had it open has missed something.
+        let gap = Event::Lost { channel, stage: LossStage::Link, count: 0, at_least: true };
+        self.deliver(&mut vec![Entry::event(self.latest_ticks, gap)]);
+    }
+
+    /// A channel is a client's from here on.
+    pub fn attach(&mut self, client: ClientId, channel: Channel, config: ChannelConfig) {
+        let ticks = self.latest_ticks;
+        let controller = self.controller[channel.index()];
+        let Some(member) = self.clients.get_mut(&client) else { return };
+        let view = &mut member.views[channel.index()];
+        view.config = Some(config);
+        member.outbox.push(Item::Attach(channel, view.clone(), ticks));
+        if let Some((state, tec, rec)) = controller.filter(|(state, ..)| *state != ErrorState::Active) {
+            let state = Entry::event(ticks, Event::State { channel, state, tec, rec });
+            member.outbox.offer(&Arc::from([state]), client, &member.views, &mut member.counts);
+        }
+    }
+
+    /// Nothing of a channel follows for a client.
+    pub fn detach(&mut self, client: ClientId, channel: Channel) {
+        let ticks = self.latest_ticks;
+        if let Some(member) = self.clients.get_mut(&client)
+            && member.views[channel.index()].config.take().is_some()
+        {
+            member.outbox.push(Item::Detach(channel, ticks));
+        }
+    }
+
+    /// The board's channels are closed, whatever had been asked of it.
+    pub fn forget_board(&mut self) {
+        self.hello = None;
+        self.open = [None; CHANNELS];
+        self.controller = [None; CHANNELS];
+        self.holder = None;
+        self.sent.clear();
+        self.again.clear();
+        self.entries = Default::default();
+        // Whoever waits for an answer learns that none will come.
+        self.asked.clear();
+        self.must_end = false;
+    }
+}
+
+impl Entries {
+    /// The same as [`Self::owner`] for any tag.
+    fn owner_of_own(&self, tag: u32) -> Option<Owner> {
+        (tag >= DEVICE_TAG).then(|| self.owner(tag)).flatten()
+    }
+}
+
+/// How a channel is opened on the board, for all who share it: what a client wants left out is left out behind it.
+pub const fn for_all(config: ChannelConfig) -> ChannelConfig {
+    let sends = !matches!(config.mode, Mode::ListenOnly);
+    ChannelConfig {
+        timing: config.timing,
+        mode: config.mode,
+        one_shot: sends && config.one_shot,
+        manual_recovery: sends && config.manual_recovery,
+        omit_data: false,
+        omit_stamps: false,
+    }
+}
+
+/// A request that concerns an entry of a table.
+pub fn clears(table: Table, channel: Channel, slot: u8) -> Command {
+    match table {
+        Table::Periodic => Command::SetPeriodic { channel, slot, entry: None },
+        Table::Triggers => Command::SetTrigger { channel, slot, entry: None },
+    }
+}

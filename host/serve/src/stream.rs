@@ -1,0 +1,283 @@
+//! What a board says, on its way to each client: once in memory, whoever waits for it.
+
+use cantap_wire::message::{ChannelConfig, DEVICE_TAG, Filter, OTHERS_TAG};
+use cantap_wire::record::{LossStage, Record, Stamp, TransmitFailure};
+use cantap_wire::{CHANNELS, Channel, Event, Frame};
+
+/// A client's number, never used twice.
+pub type ClientId = u64;
+
+/// Who asked for a transmission, and what it is called there.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Owner {
+    pub client: ClientId,
+    pub tag: u32,
+}
+
+/// A record with its absolute device time.
+#[derive(Clone, Copy, Debug)]
+pub struct Entry {
+    pub ticks: u64,
+    pub record: Record,
+    /// Of a transmission's end, if somebody asked for it.
+    pub owner: Option<Owner>,
+}
+
+impl Entry {
+    /// An event that is nobody's.
+    pub const fn event(ticks: u64, event: Event) -> Self {
+        Self { ticks, record: Record::Event(event), owner: None }
+    }
+}
+
+/// A channel as one client has it.
+#[derive(Clone, Debug, Default)]
+pub struct View {
+    /// How it was opened, if it is open.
+    pub config: Option<ChannelConfig>,
+    /// What passes; none means everything.
+    pub filters: Vec<Filter>,
+}
+
+/// Both channels as one client has them.
+pub type Views = [View; CHANNELS];
+
+impl View {
+    /// Whether the client may send on it.
+    pub fn transmits(&self) -> bool {
+        self.config.is_some_and(|config| config.mode.transmits())
+    }
+
+    fn accepts(&self, frame: &Frame) -> bool {
+        self.filters.is_empty() || self.filters.iter().any(|filter| filter.matches(frame))
+    }
+}
+
+/// What a client sees of an entry, if anything.
+pub fn shown(entry: &Entry, client: ClientId, views: &Views) -> Option<Record> {
+    let of = |channel: Channel| &views[channel.index()];
+    let is_open = |channel: Channel| of(channel).config.is_some();
+    let own_tag = entry.owner.filter(|owner| owner.client == client).map(|owner| owner.tag);
+    match entry.record {
+        Record::Received(mut received) => {
+            let view = of(received.channel);
+            let config = view.config.filter(|_| view.accepts(&received.frame))?;
+            received.data_omitted |= config.omit_data;
+            if config.omit_stamps {
+                received.stamp = Stamp::Omitted;
+            }
+            Some(Record::Received(received))
+        }
+        Record::Event(event) => {
+            let event =
+                match event {
+                    Event::SofMark { .. } => Some(event),
+                    Event::Transmitted { channel, frame, .. } => is_open(channel)
+                        .then(|| Event::Transmitted { channel, tag: own_tag.unwrap_or(OTHERS_TAG), frame }),
+                    // Whose it is not learns nothing by it: no frame of anybody was on the bus.
+                    Event::TransmitFailed { channel, reason, .. } => own_tag
+                        .filter(|_| is_open(channel))
+                        .map(|tag| Event::TransmitFailed { channel, tag, reason }),
+                    Event::Lost { channel, .. }
+                    | Event::BusError { channel, .. }
+                    | Event::ErrorsSuppressed { channel, .. }
+                    | Event::State { channel, .. } => is_open(channel).then_some(event),
+                    // Each client's channels start and stop for themselves.
+                    Event::Started { .. } | Event::Stopped { .. } => None,
+                };
+            event.map(Record::Event)
+        }
+    }
+}
+
+/// What a client was given on one channel, as a board's status counts it.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Counts {
+    /// Frames received, those among them that were lost behind the controller.
+    pub frames: u32,
+    pub lost_controller: u32,
+    pub lost_queue: u32,
+    pub transmitted: u32,
+    pub transmit_failures: u32,
+}
+
+/// Counts what a client is shown.
+pub fn count(counts: &mut [Counts; CHANNELS], record: &Record, is_own: bool) {
+    match *record {
+        Record::Received(received) => add(&mut counts[received.channel.index()].frames, 1),
+        Record::Event(Event::Lost { channel, stage, count, .. }) => {
+            let counts = &mut counts[channel.index()];
+            match stage {
+                LossStage::Controller => add(&mut counts.lost_controller, count),
+                LossStage::Queue => {
+                    add(&mut counts.lost_queue, count);
+                    add(&mut counts.frames, count);
+                }
+                LossStage::Link | LossStage::Host => add(&mut counts.frames, count),
+            }
+        }
+        Record::Event(Event::Transmitted { channel, .. }) if is_own => {
+            add(&mut counts[channel.index()].transmitted, 1);
+        }
+        Record::Event(Event::TransmitFailed { channel, reason, .. }) => {
+            let failures = if let TransmitFailure::Overtaken { periods } = reason { periods } else { 1 };
+            add(&mut counts[channel.index()].transmit_failures, failures);
+        }
+        Record::Event(_) => {}
+    }
+}
+
+/// Counters wrap, as a board's do.
+fn add(counter: &mut u32, count: u32) {
+    *counter = counter.wrapping_add(count);
+}
+
+/// Where a client was too slow: what it lost, and what is too important to be lost.
+#[derive(Debug, Default)]
+pub struct Gap {
+    /// In order, as the client sees them.
+    kept: Vec<(u64, Event)>,
+    lost: [u32; CHANNELS],
+    errors: [u32; CHANNELS],
+    /// Of the last record in it.
+    ticks: u64,
+}
+
+impl Gap {
+    /// Takes a record that the client would have seen. Returns the channel of a frame that is lost by it.
+    pub fn absorb(&mut self, ticks: u64, record: &Record) -> Option<Channel> {
+        self.ticks = ticks;
+        match *record {
+            Record::Received(received) => {
+                self.lost[received.channel.index()] += 1;
+                return Some(received.channel);
+            }
+            Record::Event(event) => match event {
+                // As many as are under way.
+                Event::Transmitted { tag, .. } if tag < DEVICE_TAG => self.kept.push((ticks, event)),
+                Event::Transmitted { channel, .. } => {
+                    self.lost[channel.index()] += 1;
+                    return Some(channel);
+                }
+                Event::TransmitFailed { .. } | Event::Lost { .. } | Event::State { .. } => {
+                    self.keep(ticks, event);
+                }
+                Event::BusError { channel, .. } => self.errors[channel.index()] += 1,
+                Event::ErrorsSuppressed { channel, count } => self.errors[channel.index()] += count,
+                // A mark is left out where there is no room, as on a board.
+                Event::Started { .. } | Event::Stopped { .. } | Event::SofMark { .. } => {}
+            },
+        }
+        None
+    }
+
+    /// Keeps one event, or adds it to one of its kind: what is kept is bounded.
+    fn keep(&mut self, ticks: u64, event: Event) {
+        let place = self.kept.iter_mut().rev().find_map(|(at, kept)| merge(kept, &event).then_some(at));
+        match place {
+            Some(at) => *at = ticks,
+            None => self.kept.push((ticks, event)),
+        }
+    }
+
+    /// What stands in the stream in place of all that.
+    pub fn events(mut self) -> Vec<(u64, Event)> {
+        self.kept.sort_by_key(|(ticks, _)| *ticks);
+        let ticks = self.ticks;
+        for channel in Channel::ALL {
+            let (lost, errors) = (self.lost[channel.index()], self.errors[channel.index()]);
+            if errors > 0 {
+                self.kept.push((ticks, Event::ErrorsSuppressed { channel, count: errors }));
+            }
+            if lost > 0 {
+                let event = Event::Lost { channel, stage: LossStage::Host, count: lost, at_least: false };
+                self.kept.push((ticks, event));
+            }
+        }
+        self.kept
+    }
+}
+
+/// Makes one event of two of a kind. Returns whether it could.
+fn merge(kept: &mut Event, next: &Event) -> bool {
+    match (kept, next) {
+        (
+            Event::Lost { channel, stage, count, at_least },
+            Event::Lost { channel: next, stage: next_stage, count: more, at_least: next_at_least },
+        ) if channel == next && stage == next_stage => {
+            *count = count.saturating_add(*more);
+            *at_least |= next_at_least;
+            true
+        }
+        (
+            Event::State { channel, state, tec, rec },
+            Event::State { channel: next, state: next_state, tec: next_tec, rec: next_rec },
+        ) if channel == next => {
+            (*state, *tec, *rec) = (*next_state, *next_tec, *next_rec);
+            true
+        }
+        (
+            Event::TransmitFailed { channel, tag, reason: TransmitFailure::Overtaken { periods } },
+            Event::TransmitFailed {
+                channel: next,
+                tag: next_tag,
+                reason: TransmitFailure::Overtaken { periods: more },
+            },
+        ) if channel == next && tag == next_tag => {
+            *periods = periods.saturating_add(*more);
+            true
+        }
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap_wire::record::{ErrorState, Received};
+
+    fn lost(channel: Channel, stage: LossStage, count: u32, at_least: bool) -> Event {
+        Event::Lost { channel, stage, count, at_least }
+    }
+
+    #[test]
+    fn a_gap_counts_frames_keeps_what_matters_and_does_not_grow_with_what_repeats() {
+        let frame: Frame = "123#11".parse().unwrap();
+        let mut gap = Gap::default();
+        let channel = Channel::Can2;
+        let received = Received { channel, frame, stamp: cantap_wire::Stamp::Exact, data_omitted: false };
+        for ticks in 0..1000 {
+            gap.absorb(ticks, &Record::Received(received));
+            for event in [
+                Event::Transmitted { channel, tag: OTHERS_TAG, frame },
+                lost(Channel::Can1, LossStage::Controller, 1, true),
+                Event::State { channel, state: ErrorState::Passive, tec: 128, rec: ticks as u8 },
+                Event::BusError { channel, kind: cantap_wire::record::BusErrorKind::Stuff, tec: 0, rec: 0 },
+                Event::TransmitFailed {
+                    channel,
+                    tag: DEVICE_TAG,
+                    reason: TransmitFailure::Overtaken { periods: 2 },
+                },
+                Event::SofMark { frame: 1, doubled: 0 },
+            ] {
+                gap.absorb(ticks, &Record::Event(event));
+            }
+        }
+        let own = Event::Transmitted { channel, tag: 7, frame };
+        gap.absorb(1000, &Record::Event(own));
+        let state = Event::State { channel, state: ErrorState::Passive, tec: 128, rec: 999u16 as u8 };
+        let overtaken = TransmitFailure::Overtaken { periods: 2000 };
+        let events = gap.events();
+        assert_eq!(
+            events,
+            [
+                (999, lost(Channel::Can1, LossStage::Controller, 1000, true)),
+                (999, state),
+                (999, Event::TransmitFailed { channel, tag: DEVICE_TAG, reason: overtaken }),
+                (1000, own),
+                (1000, Event::ErrorsSuppressed { channel, count: 1000 }),
+                (1000, lost(channel, LossStage::Host, 2000, false)),
+            ]
+        );
+    }
+}

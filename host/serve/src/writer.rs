@@ -1,0 +1,172 @@
+//! The thread that writes to one client: whatever waits, encoded as the client has its channels.
+
+use std::io::Write;
+use std::time::{Duration, Instant};
+
+use cantap::device::is_idle;
+use cantap_wire::batch::BatchWriter;
+use cantap_wire::framing::MAX_ENCODED;
+use cantap_wire::message::EndReason;
+use cantap_wire::record::{MAX_RECORD, Record, encode_event, encode_received};
+use cantap_wire::{Channel, Event, Stamp};
+
+use crate::outbox::{Item, Outbox};
+use crate::stream::{ClientId, Views, shown};
+
+/// How often to check whether the connection is over while there is nothing to write.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// A client that takes nothing for so long is gone: a peer that was switched off says nothing.
+const PATIENCE: Duration = Duration::from_secs(30);
+
+/// Writes until nothing follows. An error says why the client is let go.
+pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<(), String> {
+    let mut encoder = Encoder::new(client);
+    loop {
+        let work = outbox.take(LOOK_EVERY);
+        for answer in &work.answers {
+            // A batch of before may be half read.
+            encoder.out.push(0);
+            encoder.out.extend_from_slice(answer);
+        }
+        for item in work.items {
+            encoder.take(item);
+        }
+        encoder.finish();
+        write(output, &encoder.out, outbox)?;
+        encoder.out.clear();
+        if work.is_last {
+            return Ok(());
+        }
+    }
+}
+
+fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<(), String> {
+    let mut moved = Instant::now();
+    let mut closing: Option<Instant> = None;
+    while !bytes.is_empty() {
+        match output.write(bytes) {
+            Ok(0) => return Ok(()),
+            Ok(len) => {
+                bytes = &bytes[len..];
+                moved = Instant::now();
+            }
+            Err(error) if is_idle(&error) => {
+                if moved.elapsed() >= PATIENCE {
+                    return Err(format!("it took nothing for {} s", PATIENCE.as_secs()));
+                }
+                // Whoever does not read is not waited for at the end.
+                let is_late = |since: &mut Instant| since.elapsed() >= Duration::from_secs(1);
+                if outbox.is_closed() && is_late(closing.get_or_insert_with(Instant::now)) {
+                    return Ok(());
+                }
+            }
+            // It has left, which the other thread sees too.
+            Err(_) => return Ok(()),
+        }
+    }
+    // Whether it arrives shows at the next write.
+    let _ = output.flush();
+    Ok(())
+}
+
+/// Makes bytes of what waits.
+struct Encoder {
+    batch: Box<BatchWriter>,
+    /// Time of the last record, or the session's beginning.
+    last_ticks: u64,
+    views: Views,
+    client: ClientId,
+    out: Vec<u8>,
+}
+
+impl Encoder {
+    fn new(client: ClientId) -> Self {
+        Self {
+            batch: Box::new(BatchWriter::new()),
+            last_ticks: 0,
+            views: Views::default(),
+            client,
+            out: Vec::new(),
+        }
+    }
+
+    fn take(&mut self, item: Item) {
+        match item {
+            Item::Restart(answer, ticks) => {
+                self.batch.restart();
+                self.last_ticks = ticks;
+                self.views = Views::default();
+                self.out.push(0);
+                self.out.extend_from_slice(&answer);
+            }
+            Item::Attach(channel, view, ticks) => {
+                self.views[channel.index()] = view;
+                self.event(ticks, Event::Started { channel });
+            }
+            Item::Detach(channel, ticks) => self.stop(channel, ticks),
+            Item::Chunk(chunk) => {
+                for entry in chunk.iter() {
+                    if let Some(record) = shown(entry, self.client, &self.views) {
+                        self.record(entry.ticks, &record);
+                    }
+                }
+            }
+            Item::Gap(gap) => {
+                for (ticks, event) in gap.events() {
+                    self.event(ticks, event);
+                }
+            }
+            Item::Ended(reason, ticks) => self.end(reason, ticks),
+        }
+    }
+
+    fn stop(&mut self, channel: Channel, ticks: u64) {
+        if self.views[channel.index()].config.take().is_some() {
+            self.event(ticks.max(self.last_ticks), Event::Stopped { channel });
+        }
+    }
+
+    fn end(&mut self, reason: EndReason, ticks: u64) {
+        for channel in Channel::ALL {
+            self.stop(channel, ticks);
+        }
+        self.finish();
+        let at = self.out.len();
+        self.out.resize(at + MAX_ENCODED, 0);
+        let len = self.batch.end(reason, ticks.max(self.last_ticks), &mut self.out[at..]);
+        self.out.truncate(at + len);
+    }
+
+    fn event(&mut self, ticks: u64, event: Event) {
+        self.record(ticks, &Record::Event(event));
+    }
+
+    fn record(&mut self, ticks: u64, record: &Record) {
+        let mut bytes = [0; MAX_RECORD];
+        let difference = ticks.wrapping_sub(self.last_ticks) as i64;
+        let (len, frame_of, is_stamped) = match record {
+            Record::Received(received) => (
+                encode_received(received, difference, &mut bytes),
+                Some(received.channel),
+                received.stamp != Stamp::Omitted,
+            ),
+            Record::Event(event) => (encode_event(event, difference, &mut bytes), None, true),
+        };
+        if !self.batch.push(&bytes[..len], self.last_ticks, frame_of) {
+            self.finish();
+            // Cannot fail: any record fits an empty batch.
+            let _ = self.batch.push(&bytes[..len], self.last_ticks, frame_of);
+        }
+        if is_stamped {
+            self.last_ticks = ticks;
+        }
+    }
+
+    /// Writes the batch that was begun.
+    fn finish(&mut self) {
+        let at = self.out.len();
+        self.out.resize(at + MAX_ENCODED, 0);
+        let len = self.batch.finish(&mut self.out[at..]);
+        self.out.truncate(at + len);
+    }
+}

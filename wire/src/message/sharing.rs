@@ -1,0 +1,37 @@
+//! What a client of a shared board may do.
+
+use core::fmt;
+
+use serde::{Deserialize, Serialize};
+
+/// What a server lets a client do with the board that it shares; each includes those before it.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+pub enum Role {
+    /// Hear what the board hears.
+    #[default]
+    Listen,
+    /// Choose bit rates, store settings, restart the board; one client at a time.
+    Configure,
+    /// Send frames, acknowledge others'.
+    Send,
+}
+
+impl Role {
+    /// All of them, the least first.
+    pub const ALL: [Self; 3] = [Self::Listen, Self::Configure, Self::Send];
+
+    /// As it is typed.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Self::Listen => "listen",
+            Self::Configure => "configure",
+            Self::Send => "send",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.name())
+    }
+}

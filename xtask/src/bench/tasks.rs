@@ -1,0 +1,41 @@
+//! Where the processor's time goes while the emulated board does something: by interrupt, and by function.
+
+use anyhow::{Context, Result};
+use cantap_emu::profile::Table;
+use cantap_emu::timing::Bound;
+use cantap_sim::rig::Rig;
+
+/// Functions that cost less of the processor are not listed.
+const LEAST_PERCENT: f64 = 0.2;
+
+/// Prints the shares while `act` runs on what `prepare` made: by interrupt at best and at worst, by function at worst.
+pub fn print(
+    what: &str,
+    prepare: impl Fn(Bound) -> Result<Rig>,
+    act: impl Fn(&mut Rig) -> Result<()>,
+) -> Result<()> {
+    println!("processor by interrupt, {what}, % of the time: at best / at worst");
+    let mut shares = Vec::new();
+    let mut functions = String::new();
+    for bound in Bound::ALL {
+        let mut rig = prepare(bound)?;
+        rig.machine.reset_probe();
+        rig.machine.start_profile();
+        act(&mut rig)?;
+        let machine = &mut rig.machine;
+        let profile = machine.take_profile().context("it was started")?;
+        let span = machine.now() - machine.probe().since();
+        shares.push(machine.tasks(span));
+        let rows = profile.by_function(machine.image());
+        let name_of = &|number| machine.task_name(number);
+        functions = Table { rows: &rows, name_of, span, least_percent: LEAST_PERCENT }.to_string();
+    }
+    let [best, worst] = &shares[..] else { unreachable!("two bounds") };
+    for (task, entries, best) in best {
+        let worst = worst.iter().find(|(name, ..)| name == task).map_or(0.0, |(_, _, share)| *share);
+        println!("  {task:<24} {best:>6.2} / {worst:>5.2}  ({entries} times)");
+    }
+    println!("at worst by function: its own, and waiting for instructions, data in flash, buses, branches");
+    print!("{functions}");
+    Ok(())
+}

@@ -117,8 +117,8 @@ impl Address {
         text == "virtual" || text.starts_with("virtual:") || text.starts_with("emu:")
     }
 
-    /// Whether what stands where a trace or a device can stand is meant for a device: one that needs no port, or a serial port. What
-    /// is there as a file is one.
+    /// Whether what stands where a trace or a device can stand is meant for a device: one that needs no port, one at a server, or a
+    /// serial port. What is there as a file is one.
     pub fn is_meant_by(path: &Path) -> bool {
         if let Ok(there) = path.metadata() {
             return is_port(&there);
@@ -129,7 +129,7 @@ impl Address {
             digits
                 .is_some_and(|digits| !digits.is_empty() && digits.bytes().all(|byte| byte.is_ascii_digit()))
         };
-        Self::is_no_port(text) || text.starts_with("/dev/") || is_com(text)
+        Self::is_no_port(text) || Server::is_meant(text) || text.starts_with("/dev/") || is_com(text)
     }
 
     /// Whether a vehicle is on the virtual device's buses, which has a database of its own.
@@ -266,6 +266,7 @@ mod tests {
             ("emu:a.elf", true),
             ("COM5", true),
             ("/dev/ttyACM17", true),
+            ("tcp://bench:4000", true),
             ("drive.log", false),
             ("COMmon.log", false),
             ("-", false),

@@ -51,7 +51,7 @@ fn every_letter_is_answered_on_a_closed_channel() {
     let mut rig = plugged_in();
     let serial = say(&mut rig, "\rN\r");
     assert!(serial.len() == "\rN1234\r".len() && serial.starts_with("\rN"), "{serial:?}");
-    for digit in 0..=8 {
+    for digit in 0..=9 {
         converse(&mut rig, &[(&format!("S{digit}\r"), "\r")]);
     }
     converse(
@@ -80,7 +80,7 @@ fn every_letter_is_answered_on_a_closed_channel() {
             ("mFFFFFFFF\r", "\r"),
             ("M0000000\r", "\x07"),
             ("mFFFFFFFG\r", "\x07"),
-            ("S9\r", "\x07"),
+            ("S:\r", "\x07"),
             ("S\r", "\x07"),
             ("s001C\r", "\r"),
             ("sFFFFF\r", "\x07"),

@@ -75,8 +75,8 @@ pub struct Args {
     #[arg(short, long, value_name = "FILE", conflicts_with = "json")]
     output: Option<PathBuf>,
     /// The format to write, where the output's name does not tell.
-    #[arg(long, visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
-    format: Option<Format>,
+    #[arg(long = "format", visible_alias = "to", value_name = "FORMAT", requires = "output", add = completion::written_formats())]
+    written_format: Option<Format>,
     /// Print one JSON object per record, and behind them one with the summary.
     #[arg(long)]
     json: bool,
@@ -171,7 +171,7 @@ impl Sink {
         let stdout = || BufWriter::with_capacity(1 << 16, std::io::stdout());
         let kind = match (&args.output, args.count, args.json) {
             (Some(path), ..) => {
-                let options = WriteOptions { format: args.format, ..WriteOptions::default() };
+                let options = WriteOptions { format: args.written_format, ..WriteOptions::default() };
                 Kind::Trace(TraceOutput::create(path, &options, grows)?)
             }
             (_, true, _) => Kind::Nowhere,

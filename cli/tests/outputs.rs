@@ -86,7 +86,9 @@ fn a_run_that_is_interrupted_leaves_the_older_file_and_nothing_else() {
             .current_dir(&directory)
             .spawn()
             .unwrap();
-        let mut pipe = fs::OpenOptions::new().write(true).open(directory.join("pipe.log")).unwrap();
+        // To write alone would wait for a reader, even for one that is no more.
+        let mut pipe =
+            fs::OpenOptions::new().read(true).write(true).open(directory.join("pipe.log")).unwrap();
         pipe.write_all(&fs::read(directory.join("whole.log")).unwrap()).unwrap();
         let started = Instant::now();
         while names(&directory) == before {

@@ -29,6 +29,8 @@ enum Step {
     Fmt,
     /// Spelling.
     Typos,
+    /// Files of one crate that import each other in a circle, and public types of one crate that share a name.
+    Circles,
     /// Links in the pages, and files that they name.
     Links,
     /// Other people's crates: licences, duplicates, sources.
@@ -97,6 +99,7 @@ impl Step {
         match self {
             Step::Fmt => cmd!(shell, "cargo fmt --all --check").run()?,
             Step::Typos => return typos::check(shell),
+            Step::Circles => check::circles()?,
             Step::Links => check::links()?,
             Step::Dependencies => dependencies::check(shell)?,
             Step::OldestCompiler => return compiler::check(shell),

@@ -50,7 +50,7 @@ found = {
     "data_bytes": same(
         sum(len(data) for data in table["data"].to_pylist() if data is not None),
         sum(len(data) for data in frame["data"] if data is not None),
-        duckdb.sql(f"SELECT sum(octet_length(data))::BIGINT FROM '{frames}'").fetchone()[0],
+        duckdb.sql(f"SELECT sum(octet_length(data))::BIGINT FROM '{frames}'").fetchall()[0][0],
     ),
     "zone": str(table.schema.field("time").type),
 }

@@ -12,10 +12,10 @@ use cantap_wire::message::{
 };
 use cantap_wire::{Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply, Request};
 
-use crate::board::{Refused, Shared, only_listens};
 use crate::inbox::{Heard, Inbox};
 use crate::news::News;
 use crate::outbox::Outbox;
+use crate::shared::{Refused, Shared, only_listens};
 use crate::state::{Member, State, Table, Then, clears, for_all};
 use crate::stream::{ClientId, Views};
 use crate::writer;

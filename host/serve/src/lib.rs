@@ -14,12 +14,14 @@ pub mod lines;
 pub mod listen;
 mod news;
 mod outbox;
+mod shared;
 pub mod socketcand;
 mod state;
 mod stream;
 mod text;
 mod writer;
 
-pub use board::{Board, BoardError, Connect, ConnectError, Refused, Settings};
+pub use board::{Board, BoardError, Connect, ConnectError};
 pub use cantap_wire::message::Role;
 pub use news::News;
+pub use shared::{Refused, Settings};

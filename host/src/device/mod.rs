@@ -45,7 +45,7 @@ pub use reconnect::{Gaps, Happening, Reconnecting, Return};
 pub use serial::{Board, list, open as open_port, port_of};
 pub use several::{Several, channel_number};
 pub use stamps::{BitLengths, tighten};
-pub use watch::{Next, Watch};
+pub use watch::{Next, SilenceWatch};
 
 use crate::TraceRecord;
 use reader::{Answer, Order, Shared};

@@ -18,7 +18,7 @@ use super::clock::{ClockMap, ClockReport, Ticks};
 use super::error::Gone;
 use super::intake::{Counters, Intake, Notice, PIECE_BYTES, Transmission};
 use super::link::is_idle;
-use super::watch::{Next, Watch};
+use super::watch::{Next, SilenceWatch};
 use super::{DeviceError, SessionOver};
 
 /// Read at a time; an operating system's serial buffer is smaller.
@@ -255,7 +255,7 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
     let mut intake = Intake::new();
     let mut bytes = vec![0; READ_BYTES];
     let mut published = Published::default();
-    let mut watch = Watch::default();
+    let mut watch = SilenceWatch::default();
     let mut passed_at = Instant::now();
     let gone = loop {
         let len = match port.read(&mut bytes) {

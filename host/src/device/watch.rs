@@ -26,13 +26,13 @@ pub enum Next {
 
 /// Counts the silence.
 #[derive(Clone, Copy, Debug, Default)]
-pub struct Watch {
+pub struct SilenceWatch {
     since_asked: Duration,
     /// Since the first question behind the last answer.
     unanswered: Option<Duration>,
 }
 
-impl Watch {
+impl SilenceWatch {
     /// Time has passed; `answered` if anything was in it, refusals among it.
     pub fn pass(&mut self, passed: Duration, answered: bool) -> Next {
         let passed = passed.min(LONGEST_PASS);
@@ -62,7 +62,7 @@ mod tests {
 
     /// How long the watch takes to give up, in passes of one length.
     fn gives_up_after(pass: Duration, answered: impl Fn(u32) -> bool) -> Option<Duration> {
-        let mut watch = Watch::default();
+        let mut watch = SilenceWatch::default();
         (1..1000).find(|at| matches!(watch.pass(pass, answered(*at)), Next::GiveUp(_))).map(|at| pass * at)
     }
 
@@ -79,7 +79,7 @@ mod tests {
     #[test]
     fn time_in_which_nobody_listened_accuses_nobody() {
         // A computer that slept for an hour, and one on which each pass takes a second.
-        let mut watch = Watch::default();
+        let mut watch = SilenceWatch::default();
         while watch.pass(PASS, false) != Next::Ask {}
         assert_ne!(watch.pass(Duration::from_hours(1), false), Next::GiveUp(Duration::from_hours(1)));
         assert!(gives_up_after(Duration::from_secs(1), |_| false) > Some(Duration::from_secs(10)));

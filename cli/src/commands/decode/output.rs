@@ -10,9 +10,10 @@ use cantap_signals::Decoder;
 
 #[cfg(feature = "parquet")]
 use super::columns::{Long, PerMessage, WideFile};
+use super::command_line::Args;
 use super::decoded::Decoded;
 use super::wide::{Csv, Wide};
-use super::{Args, csv, json, text};
+use super::{csv, json, text};
 use crate::beside::Beside;
 use crate::trace_output::failed;
 use crate::wrong::wrong;

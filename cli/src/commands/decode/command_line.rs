@@ -1,0 +1,75 @@
+//! What can be asked of `cantap decode`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+#[cfg(feature = "parquet")]
+use cantap_columns::parquet::Key;
+
+use crate::args;
+use crate::completion;
+use crate::databases::DatabaseArgs;
+use crate::input::ReadArgs;
+use crate::live::LiveArgs;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap decode --db car.dbc trace.log\n  \
+    cantap decode --db car.dbc --db 2:body.toml trace.asc --signal '*Speed' --signal 'Engine.*' --csv\n  \
+    candump -L can0 | cantap decode --db car.dbc - --json\n  \
+    cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
+    cantap decode --db car.dbc trace.log -o drive.parquet\n  \
+    cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
+JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
+    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
+With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
+The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]
+pub struct Args {
+    #[command(flatten)]
+    pub databases: DatabaseArgs,
+    /// The trace; - for standard input.
+    #[arg(value_name = "IN")]
+    pub input: Option<PathBuf>,
+    #[command(flatten)]
+    pub live: LiveArgs,
+    /// Only signals of this name, or Message.Signal; with *, ? and [a-z]. Several with commas, or
+    /// repeated.
+    #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
+    pub signals: Vec<String>,
+    /// Write to this file instead of standard output. Its name may say the form: .csv, .json, or .parquet, a table for DuckDB,
+    /// Polars, pandas and Spark with a row per value, and one per loss or bus error.
+    #[arg(short, long, value_name = "FILE")]
+    pub output: Option<PathBuf>,
+    /// One line of CSV per signal.
+    #[arg(long, conflicts_with = "json")]
+    pub csv: bool,
+    /// In CSV and Parquet: a column per signal and a line per frame. Written at the end of the trace.
+    #[arg(long)]
+    pub wide: bool,
+    /// In CSV and Parquet: a column per signal and a line every TIME, with the last value of each signal; empty where it was silent for long or
+    /// frames were lost. Written at the end of the trace.
+    #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
+    pub resample: Option<Duration>,
+    /// Make FILE a folder with a Parquet file for each message, which has a column per signal, and one for losses and bus errors.
+    #[cfg(feature = "parquet")]
+    #[arg(long, requires = "output", conflicts_with_all = ["csv", "json", "wide", "resample"])]
+    pub per_message: bool,
+    /// Make FILE a folder of Parquet files, in folders named by these in this order: day, channel, or NAME=VALUE. Engines read it
+    /// as one table. Files are called as IN: decoding it again replaces them.
+    #[cfg(feature = "parquet")]
+    #[arg(long, value_name = "KEY", value_delimiter = ',', requires = "output")]
+    #[arg(conflicts_with_all = ["csv", "json", "wide", "resample", "per_message"])]
+    pub partition: Vec<Key>,
+    /// Print one JSON object per message, and behind them one with the summary.
+    #[arg(long)]
+    pub json: bool,
+    /// Unit, text and raw value of each signal too.
+    #[arg(long, requires = "json")]
+    pub details: bool,
+    /// Leave out what is wrong with databases that can be used, and which of them replaces another.
+    #[arg(short, long)]
+    pub quiet: bool,
+    #[command(flatten)]
+    pub read: ReadArgs,
+}

@@ -1,0 +1,154 @@
+//! What the threads of a shared board have in common: its state, the way to it, and questions to it.
+
+use std::io::Write;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::sync_channel;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use cantap::device::{encode, write_patiently};
+use cantap_wire::message::{ChannelConfig, Mode};
+use cantap_wire::{CHANNELS, Command, Refusal, Reply, Request};
+
+use crate::news::News;
+use crate::outbox::MOST_RECORDS;
+use crate::state::{Asked, State, Then};
+use crate::stream::ClientId;
+
+/// Longest answer of a board: saving takes two seconds.
+const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
+/// A board makes us wait while it has no room; one that takes nothing for so long is stuck.
+pub(crate) const WRITE_PATIENCE: Duration = Duration::from_secs(2);
+
+/// How a board is shared.
+#[derive(Clone, Debug)]
+pub struct Settings {
+    /// The bit rate of each channel's bus, in bit/s, at which clients hear it who choose none. Where there is none it is the one saved on
+    /// the board, if one is; else a client has to choose it, which takes [`Role::Configure`].
+    pub bitrates_bps: [Option<u32>; CHANNELS],
+    /// Records that wait for a slow client at most.
+    pub most_records: usize,
+    /// Clients at a time.
+    pub most_clients: usize,
+}
+
+impl Settings {
+    /// The same bit rate for both channels, in bit/s.
+    pub fn at(bitrate_bps: u32) -> Self {
+        Self { bitrates_bps: [Some(bitrate_bps); CHANNELS], ..Self::default() }
+    }
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self { bitrates_bps: [None; CHANNELS], most_records: MOST_RECORDS, most_clients: 32 }
+    }
+}
+
+/// What the threads share.
+pub(crate) struct Shared {
+    pub name: String,
+    pub settings: Settings,
+    pub port: Mutex<Option<Box<dyn Write + Send>>>,
+    pub state: Mutex<State>,
+    /// Something has come from the board.
+    pub changed: Condvar,
+    /// Held by whoever opens and closes channels: one at a time.
+    pub setup: Mutex<()>,
+    pub quit: AtomicBool,
+    pub next_client: AtomicU64,
+    pub news: Box<dyn Fn(News) + Send + Sync>,
+}
+
+pub(crate) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every holder leaves the state whole, even if it panicked elsewhere.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl Shared {
+    pub fn state(&self) -> MutexGuard<'_, State> {
+        lock(&self.state)
+    }
+
+    pub fn tell(&self, news: News) {
+        (self.news)(news);
+    }
+
+    pub fn next_client(&self) -> ClientId {
+        self.next_client.fetch_add(1, Ordering::Relaxed)
+    }
+
+    /// Asks the board and waits for its answer. What is to happen in the order of its stream is `then`.
+    pub fn ask(&self, command: Command, then: Then) -> Result<Reply, Refusal> {
+        let (answer, answered) = sync_channel(1);
+        let id = self.send(command, Asked { answer, then })?;
+        answered.recv_timeout(ANSWER_TIMEOUT).unwrap_or_else(|_| {
+            self.state().asked.remove(&id);
+            Err(Refusal::NoBoard)
+        })
+    }
+
+    /// Asks without waiting.
+    pub fn send(&self, command: Command, asked: Asked) -> Result<u16, Refusal> {
+        let id = {
+            let mut state = self.state();
+            if state.hello.is_none() {
+                return Err(Refusal::NoBoard);
+            }
+            state.ask(asked)
+        };
+        let bytes = encode(&Request { id, command }).map_err(|_| Refusal::Malformed)?;
+        let mut port = lock(&self.port);
+        let written = port.as_mut().map(|port| {
+            write_patiently(port, &bytes, WRITE_PATIENCE)?;
+            port.flush()
+        });
+        drop(port);
+        if !matches!(written, Some(Ok(()))) {
+            let mut state = self.state();
+            state.asked.remove(&id);
+            // Half a request may be on its way.
+            state.must_end = true;
+            return Err(Refusal::NoBoard);
+        }
+        Ok(id)
+    }
+
+    /// Asks what nobody waits for.
+    pub fn send_unattended(&self, command: Command, then: Then) {
+        let (answer, _) = sync_channel(1);
+        // If it fails, the board's thread notices.
+        let _ = self.send(command, Asked { answer, then });
+    }
+
+    /// A client is not written to any more.
+    pub fn has_written(&self) {
+        self.state().writers -= 1;
+        self.changed.notify_all();
+    }
+
+    /// Waits until the board has said what `is_there` looks for, at most `timeout`. Returns whether it has.
+    pub fn wait_for(&self, timeout: Duration, mut is_there: impl FnMut(&State) -> bool) -> bool {
+        let waited = self.changed.wait_timeout_while(self.state(), timeout, |state| !is_there(state));
+        !waited.unwrap_or_else(PoisonError::into_inner).1.timed_out()
+    }
+}
+
+/// Why a client was not let in.
+#[derive(Debug, thiserror::Error)]
+pub enum Refused {
+    /// There are as many as there may be.
+    #[error("there are {0} clients already")]
+    TooMany(usize),
+    /// The server ends.
+    #[error("the server ends")]
+    Over,
+    /// The system has no thread left.
+    #[error("the system refused a thread: {0}")]
+    Thread(#[source] std::io::Error),
+}
+
+/// Whether a mode only listens.
+pub(crate) const fn only_listens(config: &ChannelConfig) -> bool {
+    matches!(config.mode, Mode::ListenOnly)
+}

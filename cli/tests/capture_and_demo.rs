@@ -112,7 +112,7 @@ fn list_prints_one_object() {
 fn completions_are_made_for_each_shell() {
     for shell in ["bash", "zsh", "fish", "powershell", "elvish"] {
         let (code, out, _) = cantap(&format!("completions {shell}"));
-        assert!(code == Some(0) && out.contains("capture"), "{shell}");
+        assert!(code == Some(0) && out.contains("cantap"), "{shell}: {out}");
     }
     assert_eq!(cantap("completions tcsh").0, Some(2));
 }

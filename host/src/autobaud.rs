@@ -38,6 +38,12 @@ const ASK_EVERY: Duration = Duration::from_millis(2);
 const GOOD_ERROR: f64 = 0.000_3;
 /// Is what is measured not better after this time, it is taken as it is.
 const BETTER_WITHIN: Duration = Duration::from_millis(150);
+/// After one frame another may follow at once, which makes the measurement sure: a pause of so many bits says that none does.
+const PAUSE_BITS: f64 = 30.0;
+/// And of so long, at a high bit rate.
+const PAUSE: Duration = Duration::from_millis(5);
+/// How far off a guess may be, as a part of the bit rate: whoever is interrupted sees edges late, and not all of them alike.
+const GUESS_ERROR: f64 = 0.004;
 /// Edges that are looked at together: those of half a dozen frames.
 const MOST_EDGES: usize = 700;
 /// New edges that are worth a look while there is no pause: those of two frames.
@@ -173,12 +179,16 @@ impl Search<'_> {
                 Heard::Over(outcome) => return Ok(outcome),
             };
             let measured_bps = f64::from(self.device.hello().tick_hz) / measured.bit_ticks;
-            let bitrate_bps = match reach(self.device.hello().can_clock_hz, measured_bps, measured.error) {
+            let is_guess = measured.frames == 0;
+            let error = if is_guess { measured.error.max(GUESS_ERROR) } else { measured.error };
+            let bitrate_bps = match reach(self.device.hello().can_clock_hz, measured_bps, error) {
                 Reached::At { bitrate_bps } => bitrate_bps,
                 Reached::Not { .. } if measured.frames == 1 && wanted == 1 => {
                     wanted = 2;
                     continue;
                 }
+                // What is no better known than this is not said to be beyond reach.
+                Reached::Not { .. } if is_guess => return Ok(Outcome::Unreadable { edges: self.seen }),
                 Reached::Not { nearest_bps } => {
                     return Ok(Outcome::Unreachable { measured_bps, nearest_bps });
                 }
@@ -240,7 +250,9 @@ impl Search<'_> {
             if let Some((since, measured)) = found {
                 let is_good =
                     measured.error <= GOOD_ERROR || now.saturating_sub(since) > self.ticks(BETTER_WITHIN);
-                if measured.frames >= wanted && is_good {
+                let pause = self.ticks(PAUSE).max((PAUSE_BITS * measured.bit_ticks) as u64);
+                let is_alone = now.saturating_sub(self.heard) > pause;
+                if measured.frames >= wanted && is_good && (measured.frames > 1 || is_alone) {
                     return Ok(Heard::Frames(measured));
                 }
             }

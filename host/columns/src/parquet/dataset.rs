@@ -25,9 +25,15 @@ pub enum Key {
     Channel,
 }
 
+/// Names that a dataset's tables have already, and keys that have a meaning.
+const COLUMNS: [&str; 26] = [
+    "time", "channel", "event", "detail", "count", "at_least", "tx_errors", "rx_errors", "tag", "id", "extended", "remote",
+    "fd", "late", "brs", "esi", "direction", "dlc", "data", "message", "signal", "value", "raw", "text", "unit", "day",
+];
+
 /// A text is no [`Key`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' names no folders: write day, channel, or NAME=VALUE")]
+#[error("'{0}' names no folders: write day, channel, or NAME=VALUE with a name that is no column's")]
 pub struct BadKey(String);
 
 impl FromStr for Key {
@@ -39,7 +45,7 @@ impl FromStr for Key {
         match text.split_once('=') {
             None if text == "day" => Ok(Self::Day),
             None if text == "channel" => Ok(Self::Channel),
-            Some((name, value)) if word(name) && !value.is_empty() => {
+            Some((name, value)) if word(name) && !value.is_empty() && !COLUMNS.contains(&name) => {
                 Ok(Self::Fixed(name.to_owned(), value.to_owned()))
             }
             _ => Err(BadKey(text.to_owned())),
@@ -64,7 +70,7 @@ const OPEN: usize = 32;
 /// Day since 1970 and channel, as far as the keys ask for them.
 type Place = (Option<i32>, Option<u8>);
 
-/// A dataset that is being written.
+/// A dataset that is being written. Columns that the folders' names say are not in the files.
 pub struct Dataset<T, F> {
     folder: PathBuf,
     /// The files' name, without suffix.
@@ -128,7 +134,8 @@ impl<T: Table, F: Fn() -> T> Dataset<T, F> {
             1 => format!("{}.parquet", self.name),
             number => format!("{}-{number}.parquet", self.name),
         };
-        ParquetFile::create(&folder.join(name), (self.table)())
+        let left_out: &[&str] = if channel.is_some() { &["channel"] } else { &[] };
+        ParquetFile::create_without(&folder.join(name), (self.table)(), left_out)
     }
 
     /// Finishes all files.

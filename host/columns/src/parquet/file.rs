@@ -3,6 +3,7 @@
 use std::fs::{self, File};
 use std::io::{self, BufWriter};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use parquet::arrow::ArrowWriter;
 use parquet::basic::{Compression, ZstdLevel};
@@ -22,6 +23,8 @@ pub struct ParquetFile<T> {
     /// What to put rows into; [`Self::flush`] them now and then.
     pub table: T,
     writer: ArrowWriter<BufWriter<File>>,
+    /// The columns that are written.
+    columns: Vec<usize>,
     temporary: Temporary,
     path: PathBuf,
 }
@@ -38,6 +41,11 @@ impl Drop for Temporary {
 impl<T: Table> ParquetFile<T> {
     /// Begins a file, in a folder that is there.
     pub fn create(path: &Path, table: T) -> Result<Self, ParquetError> {
+        Self::create_without(path, table, &[])
+    }
+
+    /// Begins a file that does not have these columns: where a folder's name says the same, some readers take neither.
+    pub(super) fn create_without(path: &Path, table: T, left_out: &[&str]) -> Result<Self, ParquetError> {
         let name = path.file_name().ok_or_else(|| io::Error::from(io::ErrorKind::InvalidFilename))?;
         let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
         temporary.push(name);
@@ -48,8 +56,12 @@ impl<T: Table> ParquetFile<T> {
             .set_max_row_group_row_count(Some(GROUP_ROWS))
             .set_created_by(concat!("cantap ", env!("CARGO_PKG_VERSION")).to_owned())
             .build();
-        let writer = ArrowWriter::try_new(file, table.columns(), Some(properties))?;
-        Ok(Self { table, writer, temporary, path: path.to_owned() })
+        let schema = table.columns();
+        let is_kept = |column: &usize| !left_out.contains(&schema.field(*column).name().as_str());
+        let columns: Vec<usize> = (0..schema.fields().len()).filter(is_kept).collect();
+        let schema = Arc::new(schema.project(&columns)?);
+        let writer = ArrowWriter::try_new(file, schema, Some(properties))?;
+        Ok(Self { table, writer, columns, temporary, path: path.to_owned() })
     }
 
     /// Writes the table's rows if they are worth a batch.
@@ -58,7 +70,7 @@ impl<T: Table> ParquetFile<T> {
     }
 
     fn write(&mut self) -> Result<(), ParquetError> {
-        self.writer.write(&self.table.batch())
+        self.writer.write(&self.table.batch().project(&self.columns)?)
     }
 
     /// Writes what is left, and puts the file in its place.

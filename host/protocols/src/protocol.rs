@@ -27,8 +27,16 @@ pub enum Protocol {
 
 impl Protocol {
     /// All of them.
-    pub const ALL: [Self; 6] =
-        [Self::IsoTp, Self::Uds, Self::Kwp2000, Self::Obd, Self::J1939, Self::Nmea2000];
+    pub const ALL: [Self; 8] = [
+        Self::IsoTp,
+        Self::Uds,
+        Self::Kwp2000,
+        Self::Obd,
+        Self::J1939,
+        Self::Nmea2000,
+        Self::CanOpen,
+        Self::DeviceNet,
+    ];
 
     /// As it is called in text, JSON and on the command line.
     pub const fn name(self) -> &'static str {
@@ -71,5 +79,21 @@ impl FromStr for Protocol {
         let name = text.to_ascii_lowercase();
         let found = Self::ALL.into_iter().find(|protocol| protocol.name() == name);
         found.ok_or_else(|| UnknownProtocol { name: text.to_owned() })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A protocol that is missing in the list could not be asked for by its name. The last one's number is the list's length.
+    #[test]
+    fn every_protocol_can_be_named() {
+        assert_eq!(Protocol::ALL.len(), Protocol::DeviceNet as usize + 1);
+        for (number, protocol) in Protocol::ALL.into_iter().enumerate() {
+            assert_eq!(protocol as usize, number);
+            assert_eq!(protocol.name().parse(), Ok(protocol));
+        }
+        assert!("odb".parse::<Protocol>().is_err());
     }
 }

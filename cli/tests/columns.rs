@@ -63,7 +63,7 @@ fn engines_read_what_the_trace_has() {
         cantap(folder, line);
     }
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/columns_peer.py");
-    let files = ["frames.parquet", "signals.parquet", "fleet", "messages/EngineData.parquet", "wide.parquet"];
+    let files = ["frames.parquet", "signals.parquet", "fleet", "messages/ECM_Engine1.parquet", "wide.parquet"];
     let output = Command::new(python).arg(script).args(files).current_dir(folder).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let found: Value = serde_json::from_slice(&output.stdout).unwrap();
@@ -99,7 +99,7 @@ fn engines_read_what_the_trace_has() {
 
     let rows: u64 = found["dataset"].as_array().unwrap().iter().map(|place| place[3].as_u64().unwrap()).sum();
     assert_eq!(rows, frames + 2);
-    let engine = sums.iter().filter(|(name, _)| name.starts_with("EngineData.")).count();
+    let engine = sums.iter().filter(|(name, _)| name.starts_with("ECM_Engine1.")).count();
     assert!(found["message"]["rows"].as_u64().unwrap() > 100, "{found}");
     assert!(found["message"]["columns"].as_array().unwrap().len() >= 3 + engine, "{found}");
     assert_eq!(found["message"]["units"]["EngineSpeed"], "rpm", "{found}");

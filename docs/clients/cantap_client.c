@@ -210,7 +210,7 @@ static void response(Reader *m) {
     unsigned index = (unsigned)number(m);
     if (!m->ok) { puts("unreadable"); return; }
     printf("response %u %s%s", id, refused ? "refused " : "", refused ? NAME(REFUSALS, index) : NAME(REPLIES, index));
-    if (refused) for (int n = index == 14 ? 2 : index == 0 || index == 13 || index == 20; n > 0; n--) printf(" %" PRIu64, number(m));
+    if (refused) for (int n = index == 14 ? 2 : index == 0 || index == 13 || index == 21; n > 0; n--) printf(" %" PRIu64, number(m));
     puts("");
     if (!refused && index == HELLO) sequence = frames[0] = frames[1] = lost[0] = lost[1] = 0;
     size_t len = (size_t)(m->end - m->at);

@@ -68,7 +68,8 @@ fn a_dataset_has_a_folder_for_each_day_and_channel() {
     assert!(first.contains(&"vehicle=a%2Fb/day=1970-01-17/channel=2/drive.parquet".to_owned()), "{first:?}");
     let path = |day: &str| folder.path().join("vehicle=a%2Fb").join(day).join("channel=1");
     let times = |name: &str| -> Vec<i64> {
-        let reader = ParquetRecordBatchReaderBuilder::try_new(File::open(path("day=1970-01-02").join(name)).unwrap());
+        let reader =
+            ParquetRecordBatchReaderBuilder::try_new(File::open(path("day=1970-01-02").join(name)).unwrap());
         let batch = reader.unwrap().build().unwrap().next().unwrap().unwrap();
         assert!(batch.column_by_name("channel").is_none(), "the folder says it");
         batch.column_by_name("time").unwrap().as_primitive::<TimestampNanosecondType>().values().to_vec()

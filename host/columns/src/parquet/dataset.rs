@@ -27,8 +27,32 @@ pub enum Key {
 
 /// Names that a dataset's tables have already, and keys that have a meaning.
 const COLUMNS: [&str; 26] = [
-    "time", "channel", "event", "detail", "count", "at_least", "tx_errors", "rx_errors", "tag", "id", "extended", "remote",
-    "fd", "late", "brs", "esi", "direction", "dlc", "data", "message", "signal", "value", "raw", "text", "unit", "day",
+    "time",
+    "channel",
+    "event",
+    "detail",
+    "count",
+    "at_least",
+    "tx_errors",
+    "rx_errors",
+    "tag",
+    "id",
+    "extended",
+    "remote",
+    "fd",
+    "late",
+    "brs",
+    "esi",
+    "direction",
+    "dlc",
+    "data",
+    "message",
+    "signal",
+    "value",
+    "raw",
+    "text",
+    "unit",
+    "day",
 ];
 
 /// A text is no [`Key`].

@@ -34,7 +34,8 @@ fn drive(folder: &Path) {
     let log = fs::read_to_string(folder.join("captured.log")).unwrap();
     let (before, after) = log.split_at(log[..log.len() / 2].rfind('\n').unwrap() + 1);
     let stamp = after.split(' ').next().unwrap();
-    let events = format!("# {stamp} can0 cantap: lost 7 queue\n{stamp} can0 20000088#0000000000000000\n");
+    let events =
+        format!("{stamp} can0 20000004#0001000000000000\n{stamp} can0 20000088#0000000000000000\n");
     fs::write(folder.join("drive.log"), format!("{before}{events}{after}")).unwrap();
 }
 

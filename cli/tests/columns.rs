@@ -34,8 +34,7 @@ fn drive(folder: &Path) {
     let log = fs::read_to_string(folder.join("captured.log")).unwrap();
     let (before, after) = log.split_at(log[..log.len() / 2].rfind('\n').unwrap() + 1);
     let stamp = after.split(' ').next().unwrap();
-    let events =
-        format!("{stamp} can0 20000004#0001000000000000\n{stamp} can0 20000088#0000000000000000\n");
+    let events = format!("{stamp} can0 20000004#0001000000000000\n{stamp} can0 20000088#0000000000000000\n");
     fs::write(folder.join("drive.log"), format!("{before}{events}{after}")).unwrap();
 }
 
@@ -64,7 +63,8 @@ fn engines_read_what_the_trace_has() {
         cantap(folder, line);
     }
     let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/columns_peer.py");
-    let files = ["frames.parquet", "signals.parquet", "fleet", "messages/ECM_Engine1.parquet", "wide.parquet"];
+    let files =
+        ["frames.parquet", "signals.parquet", "fleet", "messages/ECM_Engine1.parquet", "wide.parquet"];
     let output = Command::new(python).arg(script).args(files).current_dir(folder).output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let found: Value = serde_json::from_slice(&output.stdout).unwrap();

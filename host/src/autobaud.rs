@@ -1,8 +1,8 @@
 //! Finds a bus's bit rate without a word, by measuring it.
 //!
 //! The device tells the edges of the channel's receive pin while its controller is off the bus. One frame is enough to know the length of a
-//! bit to a thousandth ([`measure`]), whatever the bit rate; where none is whole, pieces of many give a guess ([`rough`]). What the clock
-//! reaches of that is [`rates`]'. The controller then listens at that rate, to confirm it with frames of its own. Nothing is ever driven.
+//! bit to a thousandth (`measure`), whatever the bit rate; where none is whole, pieces of many give a guess (`rough`). What the clock
+//! reaches of that is `rates`'. The controller then listens at that rate, to confirm it with frames of its own. Nothing is ever driven.
 
 mod measure;
 mod rates;

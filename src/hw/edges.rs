@@ -70,7 +70,7 @@ impl Kept {
         }
         let place = written as usize % EDGES_KEPT;
         self.at[place].store(at, Relaxed);
-        self.marks[place].store(u8::from(dominant) * DOMINANT | u8::from(unsure) * UNSURE, Relaxed);
+        self.marks[place].store((u8::from(dominant) * DOMINANT) | (u8::from(unsure) * UNSURE), Relaxed);
         self.written.store(written.wrapping_add(1), Release);
         true
     }

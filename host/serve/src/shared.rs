@@ -24,7 +24,7 @@ pub(crate) const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 #[derive(Clone, Debug)]
 pub struct Settings {
     /// The bit rate of each channel's bus, in bit/s, at which clients hear it who choose none. Where there is none it is the one saved on
-    /// the board, if one is; else a client has to choose it, which takes [`Role::Configure`].
+    /// the board, if one is; else a client has to choose it, which takes [`Role::Configure`](crate::Role::Configure).
     pub bitrates_bps: [Option<u32>; CHANNELS],
     /// Records that wait for a slow client at most.
     pub most_records: usize,

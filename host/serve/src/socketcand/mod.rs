@@ -1,7 +1,7 @@
 //! The socketcand protocol (<https://github.com/linux-can/socketcand>, doc/protocol.md), for SavvyCAN, Kayak, python-can and
 //! whatever else speaks it: raw, BCM and control mode, and the beacon. ISO-TP mode is not there.
 //!
-//! The page leaves some things open, and clients differ: [`told`] says how frames are written, [`command`] how they are read. The bus is only
+//! The page leaves some things open, and clients differ: `told` says how frames are written, `command` how they are read. The bus is only
 //! listened to until a client that may send does so; its frames then come back to the others, and not to itself. What is sent again and
 //! again (`add`) the board sends, at its own clock's times.
 

@@ -73,6 +73,23 @@ impl Interned {
     }
 }
 
+/// The columns' names and types.
+pub fn fields() -> Vec<Field> {
+    let mut fields = events::fields();
+    let text = Texts::<Int32Type>::data_type();
+    fields.extend([
+        Field::new("id", DataType::UInt32, true),
+        Field::new("extended", DataType::Boolean, true),
+        Field::new("message", text.clone(), true),
+        Field::new("signal", text.clone(), true),
+        Field::new("value", DataType::Float64, true),
+        Field::new("raw", DataType::UInt64, true),
+        Field::new("text", text.clone(), true),
+        Field::new("unit", text, true),
+    ]);
+    fields
+}
+
 impl SignalColumns {
     /// A table for what this decoder finds.
     pub fn new(decoder: &Decoder) -> Self {
@@ -88,20 +105,8 @@ impl SignalColumns {
             (reference, MessageKeys { message: messages.place(&message.name), signals })
         });
         let keys = Arc::new(keys.collect());
-        let mut fields = events::fields();
-        let text = Texts::<Int32Type>::data_type();
-        fields.extend([
-            Field::new("id", DataType::UInt32, true),
-            Field::new("extended", DataType::Boolean, true),
-            Field::new("message", text.clone(), true),
-            Field::new("signal", text.clone(), true),
-            Field::new("value", DataType::Float64, true),
-            Field::new("raw", DataType::UInt64, true),
-            Field::new("text", text.clone(), true),
-            Field::new("unit", text, true),
-        ]);
         Self {
-            schema: Arc::new(Schema::new(fields)),
+            schema: Arc::new(Schema::new(fields())),
             events: Events::new(VALUE),
             id: UInt32Builder::new(),
             extended: BooleanBuilder::new(),

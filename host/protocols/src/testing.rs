@@ -27,6 +27,18 @@ pub fn hex(bytes: &[u8]) -> String {
     })
 }
 
+/// Drops, doubles and swaps up to five frames.
+pub fn disturb<T: Clone>(frames: &mut Vec<T>, random: &mut fastrand::Rng) {
+    for _ in 0..random.usize(1..6) {
+        let place = random.usize(0..frames.len() - 1);
+        match random.u8(0..3) {
+            0 => drop(frames.remove(place)),
+            1 => frames.insert(place, frames[place].clone()),
+            _ => frames.swap(place, place + 1),
+        }
+    }
+}
+
 /// What an assembler makes of the records.
 pub fn events(mut assembler: impl Assembler, records: &[TraceRecord]) -> Vec<Event> {
     let mut events = Vec::new();

@@ -13,6 +13,7 @@ use parquet::errors::ParquetError;
 use rustc_hash::FxHashMap;
 
 use super::{ParquetFile, Table};
+use crate::{FrameColumns, signals};
 
 /// What names a level of folders.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -25,35 +26,13 @@ pub enum Key {
     Channel,
 }
 
-/// Names that a dataset's tables have already, and keys that have a meaning.
-const COLUMNS: [&str; 26] = [
-    "time",
-    "channel",
-    "event",
-    "detail",
-    "count",
-    "at_least",
-    "tx_errors",
-    "rx_errors",
-    "tag",
-    "id",
-    "extended",
-    "remote",
-    "fd",
-    "late",
-    "brs",
-    "esi",
-    "direction",
-    "dlc",
-    "data",
-    "message",
-    "signal",
-    "value",
-    "raw",
-    "text",
-    "unit",
-    "day",
-];
+/// Whether a dataset's tables have a column of this name already, or a folder may.
+fn is_taken(name: &str) -> bool {
+    let of_signals = signals::fields();
+    name == "day"
+        || FrameColumns::schema().field_with_name(name).is_ok()
+        || of_signals.iter().any(|field| field.name() == name)
+}
 
 /// A text is no [`Key`].
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -69,7 +48,7 @@ impl FromStr for Key {
         match text.split_once('=') {
             None if text == "day" => Ok(Self::Day),
             None if text == "channel" => Ok(Self::Channel),
-            Some((name, value)) if word(name) && !value.is_empty() && !COLUMNS.contains(&name) => {
+            Some((name, value)) if word(name) && !value.is_empty() && !is_taken(name) => {
                 Ok(Self::Fixed(name.to_owned(), value.to_owned()))
             }
             _ => Err(BadKey(text.to_owned())),

@@ -1,7 +1,7 @@
 use cantap_trace::{Direction, FdFrame, Id, TraceEvent, TraceFrame, TraceRecord};
 
 use super::*;
-use crate::testing::{at, hex, lost};
+use crate::testing::{self, at, hex, lost};
 
 fn transfers(pairs: &[&str], records: &[TraceRecord]) -> Vec<Transfer> {
     let pairs: Vec<Pair> = pairs.iter().map(|pair| pair.parse().unwrap()).collect();
@@ -208,14 +208,7 @@ fn transfers_at_random_are_whole_and_right_or_said_to_be_broken() {
             order.into_iter().map(|sender| iterators[sender].next().unwrap()).collect();
         let disturbed = round % 3 > 0;
         if disturbed {
-            for _ in 0..random.usize(1..6) {
-                let place = random.usize(0..frames.len() - 1);
-                match random.u8(0..3) {
-                    0 => drop(frames.remove(place)),
-                    1 => frames.insert(place, frames[place].clone()),
-                    _ => frames.swap(place, place + 1),
-                }
-            }
+            testing::disturb(&mut frames, &mut random);
         }
         let records: Vec<_> =
             frames.iter().enumerate().map(|(ms, frame)| at(ms as f64 / 10.0, frame)).collect();

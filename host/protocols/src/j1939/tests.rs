@@ -180,14 +180,7 @@ fn messages_at_random_are_whole_and_right_or_said_to_be_broken() {
         }
         let disturbed = round % 3 > 0;
         if disturbed {
-            for _ in 0..random.usize(1..6) {
-                let place = random.usize(0..lines.len() - 1);
-                match random.u8(0..3) {
-                    0 => drop(lines.remove(place)),
-                    1 => lines.insert(place, lines[place].clone()),
-                    _ => lines.swap(place, place + 1),
-                }
-            }
+            testing::disturb(&mut lines, &mut random);
         }
         let records: Vec<_> = lines.iter().enumerate().map(|(ms, (_, frame))| at(ms as f64, frame)).collect();
         let events = testing::events(J1939::default(), &records);

@@ -18,6 +18,8 @@ pub mod socketcand;
 mod state;
 mod stream;
 mod text;
+#[cfg(feature = "tls")]
+pub mod tls;
 mod writer;
 
 pub use board::{Board, BoardError, Connect, ConnectError, Refused, Settings};

@@ -1,7 +1,7 @@
-//! Where a server is that shares a board: `unix:PATH`, `tcp://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
+//! Where a server is that shares a board: `unix:PATH`, `tcp://HOST:PORT`, `tls://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
 
 use std::io::ErrorKind;
-#[cfg(unix)]
+#[cfg(any(unix, feature = "tls"))]
 use std::path::PathBuf;
 use std::process::Command;
 
@@ -20,6 +20,9 @@ pub enum Server {
     Unix(PathBuf),
     /// At `HOST:PORT`.
     Tcp(String),
+    /// At `HOST:PORT`, encrypted, with this client's keys, if they are named here.
+    #[cfg(feature = "tls")]
+    Tls(String, Option<PathBuf>),
     /// Started for this client on another computer.
     Ssh(Ssh),
 }
@@ -36,7 +39,7 @@ pub struct Ssh {
 }
 
 /// How servers' addresses begin.
-const SCHEMES: [&str; 3] = ["unix:", "tcp:", "ssh:"];
+const SCHEMES: [&str; 4] = ["unix:", "tcp:", "tls:", "ssh:"];
 
 impl Server {
     /// Whether a text is meant for a server.
@@ -58,9 +61,18 @@ impl Server {
         if let Some(place) = text.strip_prefix("tcp://").filter(|place| !place.is_empty()) {
             return with_port(place).map(Self::Tcp);
         }
+        #[cfg(feature = "tls")]
+        if let Some(place) = text.strip_prefix("tls://").filter(|place| !place.is_empty()) {
+            let (place, keys) = match place.split_once("?keys=") {
+                Some((place, keys)) => (place, Some(PathBuf::from(keys))),
+                None => (place, None),
+            };
+            return with_port(place).map(|place| Self::Tls(place, keys));
+        }
         match text.strip_prefix("ssh://") {
             Some(place) if !place.is_empty() => Ssh::parse(place).map(Self::Ssh),
-            _ => Err("write it as unix:PATH, tcp://HOST:PORT or ssh://[USER@]HOST[/DEVICE]".to_owned()),
+            _ => Err("write it as unix:PATH, tcp://HOST:PORT, tls://HOST:PORT or ssh://[USER@]HOST[/DEVICE]"
+                .to_owned()),
         }
     }
 
@@ -70,6 +82,15 @@ impl Server {
             #[cfg(unix)]
             Self::Unix(path) => (path.display().to_string(), connect::unix(path)),
             Self::Tcp(address) => (address.clone(), connect::tcp(address)),
+            #[cfg(feature = "tls")]
+            Self::Tls(address, keys) => {
+                let linked = cantap_serve::tls::connect(address, &files(keys.as_deref())?);
+                return linked.with_context(|| {
+                    format!(
+                        "'{address}' lets nobody in with these keys, or is not there; they and the server's must be of one authority"
+                    )
+                });
+            }
             Self::Ssh(ssh) => {
                 let mut command = ssh.command();
                 let program = command.get_program().to_string_lossy().into_owned();
@@ -91,6 +112,20 @@ impl Server {
             anyhow::anyhow!("'{name}': {advice} ({error})")
         })
     }
+}
+
+/// This client's keys: those that the address names, else those of `CANTAP_KEYS`.
+#[cfg(feature = "tls")]
+fn files(keys: Option<&std::path::Path>) -> anyhow::Result<cantap_serve::tls::Files> {
+    let of_environment =
+        || std::env::var_os("CANTAP_KEYS").filter(|keys| !keys.is_empty()).map(PathBuf::from);
+    let keys = keys.map(PathBuf::from).or_else(of_environment).context(
+        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or behind the address as ?keys=FOLDER/NAME",
+    )?;
+    let (Some(folder), Some(name)) = (keys.parent(), keys.file_name().and_then(|name| name.to_str())) else {
+        anyhow::bail!("'{}' names no keys; write FOLDER/NAME, as for FOLDER/NAME.pem", keys.display());
+    };
+    Ok(cantap_serve::tls::Keys::files(folder, name))
 }
 
 /// The port that goes without saying.
@@ -175,9 +210,19 @@ mod tests {
         assert_eq!(parse("tcp://[::1]:5"), Ok(Server::Tcp("[::1]:5".to_owned())));
         #[cfg(unix)]
         assert_eq!(parse("unix:/run/a"), Ok(Server::Unix("/run/a".into())));
-        for wrong in
-            ["tcp:car", "tcp://", "tcp://::1", "tcp://car:x", "ssh:car", "ssh://", "ssh://-oProxyCommand=x"]
-        {
+        #[cfg(feature = "tls")]
+        assert_eq!(parse("tls://car?keys=k/me"), Ok(Server::Tls(format!("car:{PORT}"), Some("k/me".into()))));
+        for wrong in [
+            "tls:car",
+            "tls://",
+            "tcp:car",
+            "tcp://",
+            "tcp://::1",
+            "tcp://car:x",
+            "ssh:car",
+            "ssh://",
+            "ssh://-oProxyCommand=x",
+        ] {
             assert!(parse(wrong).is_err(), "{wrong}");
         }
     }

@@ -255,6 +255,35 @@ fn a_server_that_is_killed_leaves_a_gap_and_the_capture_goes_on_with_the_next() 
     assert_eq!(summary["gaps"]["count"], 1, "{summary}");
 }
 
+#[cfg(feature = "tls")]
+#[test]
+fn clients_of_other_computers_come_with_keys() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = folder.path().join("keys").display().to_string();
+    let (code, _, err) = run(&format!("serve keygen {keys} --client alice:listen"));
+    assert_eq!(code, Some(2), "{err}");
+    assert!(err.contains("--host"), "{err}");
+    let (code, out, err) = run(&format!("serve keygen {keys} --host 127.0.0.1 --client alice:listen"));
+    assert_eq!(code, Some(0), "{err}");
+    assert!(out.contains("alice-key.pem") && out.contains("server-key.pem"), "{out}");
+    let files = format!("--tls {keys}/server.pem,{keys}/server-key.pem --clients {keys}/ca.pem");
+    let server = Server::start(&format!("-d virtual:load=50 -b 500k --tcp 0 {files} --allow send"), 1);
+    let at = &server.at[0];
+    assert!(at.starts_with("tls://127.0.0.1:"), "{at}");
+    let (code, _, err) = run(&format!("info -d {at}"));
+    assert_eq!(code, Some(1));
+    assert!(err.contains("CANTAP_KEYS"), "{err}");
+    let file = folder.path().join("far.log");
+    nothing_lost(&capture(&format!("{at}?keys={keys}/alice"), &file, "-t 500ms").output().unwrap());
+    assert!(log(&file).len() > 100);
+    let (code, _, err) = run(&format!("send -d {at}?keys={keys}/alice -b 500k 1 123#11"));
+    assert_eq!(code, Some(1));
+    assert!(err.contains("the right to send"), "{err}");
+    // Unencrypted, it is nobody.
+    let (code, _, err) = run(&format!("info -d {}", at.replace("tls:", "tcp:")));
+    assert_eq!(code, Some(1), "{err}");
+}
+
 /// Garbage, half-open peers and floods harm nobody, and hear nothing.
 #[test]
 fn strangers_on_the_port_hear_nothing_and_take_nobodys_place() {

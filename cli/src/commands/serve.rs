@@ -1,9 +1,14 @@
 //! `cantap serve`: a device for many programs at once, on this machine or on others.
 
+#[cfg(feature = "tls")]
+mod keys;
+
 use std::io::{self, ErrorKind, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr};
 #[cfg(unix)]
-use std::path::{Path, PathBuf};
+use std::path::Path;
+#[cfg(any(unix, feature = "tls"))]
+use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,6 +32,7 @@ use crate::{interrupt, stderr};
 /// The command line.
 #[derive(clap::Args)]
 #[command(
+    args_conflicts_with_subcommands = true,
     after_help = "Clients take -d unix:PATH, -d tcp://HOST:PORT or -d ssh://[USER@]HOST[/DEVICE] in place of a port, in every command. A \
                   second device is\nat the same path with -2 behind its name, and at the next port.\n\n\
                   Nothing is sent and nothing acknowledged while no client that may send has asked for it.\n\n\
@@ -34,9 +40,14 @@ use crate::{interrupt, stderr};
                   cantap capture -d unix: -o drive.log\n  \
                   cantap serve -d /dev/ttyACM0 -b 500k -b 2:250k --tcp --allow send\n  \
                   cantap monitor -d tcp://127.0.0.1\n  \
-                  cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log"
+                  cantap capture -d ssh://me@vehicle/dev/ttyACM0 -b 500k -o drive.log\n  \
+                  cantap serve keygen keys --host vehicle --client alice:send\n  \
+                  cantap serve -d /dev/ttyACM0 -b 500k --tcp 192.0.2.7 --tls keys/server.pem,keys/server-key.pem --clients keys/ca.pem"
 )]
 pub struct Args {
+    #[cfg(feature = "tls")]
+    #[command(subcommand)]
+    keys: Option<keys::Command>,
     /// Where the device is: a serial port, or virtual. Repeat for several. Without it, the board that is connected.
     #[arg(short, long = "device", value_name = "DEVICE")]
     devices: Vec<Address>,
@@ -52,9 +63,18 @@ pub struct Args {
     #[cfg(unix)]
     #[arg(long, value_name = "PATH")]
     unix: Option<PathBuf>,
-    /// Listen on a TCP port of this computer, which all its users can reach; 127.0.0.1:29537 unless given.
+    /// Listen on a TCP port of this computer, which all its users can reach; 127.0.0.1:29537 unless given. At another
+    /// address only with --tls.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
     tcp: Option<String>,
+    /// Let clients of other computers in at --tcp, encrypted: this server's certificate and key (PEM).
+    #[cfg(feature = "tls")]
+    #[arg(long, value_name = "CERT,KEY", requires_all = ["tcp", "clients"], value_parser = keys::two_files)]
+    tls: Option<(PathBuf, PathBuf)>,
+    /// The certificate of the authority that clients' certificates are of.
+    #[cfg(feature = "tls")]
+    #[arg(long, value_name = "CA", requires = "tls")]
+    clients: Option<PathBuf>,
     /// Speak the socketcand protocol, for SavvyCAN, Kayak and python-can; at 127.0.0.1:29536 unless given. At an address that other
     /// computers reach, clients may only listen: the protocol does not ask who they are.
     #[arg(long, value_name = "ADDR:PORT", num_args = 0..=1, default_missing_value = "127.0.0.1")]
@@ -76,6 +96,10 @@ const STDIN_BYTES: usize = 16 * 1024;
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    #[cfg(feature = "tls")]
+    if let Some(keys) = &args.keys {
+        return keys.run();
+    }
     let addresses = Boards::new(&args.devices, &Channels::all())?;
     let addresses = addresses.addresses();
     if args.stdio && addresses.len() > 1 {
@@ -84,7 +108,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut timing = TimingArgs::default();
     timing.set_bit_rates(args.bitrates.clone());
     timing.check_channels(addresses.len())?;
-    let tcp = args.tcp.as_deref().map(|text| loopback(text, PORT)).transpose()?;
+    let way = Way::of(args)?;
+    let tcp = args.tcp.as_deref().map(|text| match way {
+        Way::Plain => loopback(text, PORT),
+        #[cfg(feature = "tls")]
+        Way::Encrypted(_) => address(text, PORT),
+    });
+    let tcp = tcp.transpose()?;
     let beside = Beside {
         socketcand: args.socketcand.as_deref().map(|text| address(text, socketcand::PORT)).transpose()?,
         lines: args.lines.as_deref().map(|text| loopback(text, LINES_PORT)).transpose()?,
@@ -100,7 +130,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.stdio {
         return serve_stdio(&boards[0], args.allow);
     }
-    let listening = listen(args, tcp, &beside, &boards)?;
+    let listening = listen(args, tcp.map(|tcp| (tcp, way)).as_ref(), &beside, &boards)?;
     while !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }
@@ -184,8 +214,8 @@ fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
     let address = address(text, port)?;
     if !address.ip().is_loopback() {
         return Err(wrong(format!(
-            "at {address} everybody on the network could use the device; listen at 127.0.0.1 and let clients come by ssh \
-             (-d ssh://HOST/…)"
+            "at {address} everybody on the network could use the device; let clients come by ssh (-d ssh://HOST/…), or \
+             give --tls and --clients (`cantap serve keygen` makes the keys)"
         )));
     }
     Ok(address)
@@ -194,7 +224,7 @@ fn loopback(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
 /// Opens every way in and prints it.
 fn listen(
     args: &Args,
-    tcp: Option<SocketAddr>,
+    tcp: Option<&(SocketAddr, Way)>,
     beside: &Beside,
     boards: &[Arc<Board>],
 ) -> anyhow::Result<Vec<Listening>> {
@@ -219,16 +249,19 @@ fn listen(
             ways.push(way);
         }
         #[cfg(not(unix))]
-        let tcp = Some(tcp.unwrap_or(SocketAddr::from((Ipv4Addr::LOCALHOST, PORT))));
-        if let Some(first) = tcp {
+        let tcp =
+            tcp.or(Some(&(SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), PORT), Way::Plain)));
+        if let Some((first, way)) = tcp {
             let port = match first.port() {
                 0 => 0,
                 port => port + number as u16,
             };
             let address = SocketAddr::new(first.ip(), port);
-            let way = listen::tcp(board, address, args.allow)
+            let scheme = way.scheme();
+            let way = way
+                .listen(board, address, args.allow)
                 .with_context(|| format!("nobody can listen at {address}; give another port with --tcp"))?;
-            names.push(format!("tcp://{}", way.address().unwrap_or(address)));
+            names.push(format!("{scheme}://{}", way.address().unwrap_or(address)));
             ways.push(way);
         }
         said.push((board.name(), names));
@@ -253,6 +286,45 @@ fn listen(
         );
     }
     Ok(ways)
+}
+
+/// How clients are let in at a TCP port.
+enum Way {
+    /// As they are.
+    Plain,
+    /// By their certificates.
+    #[cfg(feature = "tls")]
+    Encrypted(cantap_serve::tls::Server),
+}
+
+impl Way {
+    #[cfg(feature = "tls")]
+    fn of(args: &Args) -> anyhow::Result<Self> {
+        Ok(keys::server(args)?.map_or(Self::Plain, Self::Encrypted))
+    }
+
+    #[cfg(not(feature = "tls"))]
+    #[expect(clippy::unnecessary_wraps, reason = "as with TLS")]
+    const fn of(_args: &Args) -> anyhow::Result<Self> {
+        Ok(Self::Plain)
+    }
+
+    /// As addresses name it.
+    const fn scheme(&self) -> &'static str {
+        match self {
+            Self::Plain => "tcp",
+            #[cfg(feature = "tls")]
+            Self::Encrypted(_) => "tls",
+        }
+    }
+
+    fn listen(&self, board: &Arc<Board>, address: SocketAddr, most: Role) -> io::Result<Listening> {
+        match self {
+            Self::Plain => listen::tcp(board, address, most),
+            #[cfg(feature = "tls")]
+            Self::Encrypted(server) => cantap_serve::tls::listen(board, address, most, server),
+        }
+    }
 }
 
 /// Other programs' ways in, each to all boards.

@@ -19,6 +19,8 @@ pub mod socketcand;
 mod state;
 mod stream;
 mod text;
+#[cfg(feature = "tls")]
+pub mod tls;
 mod writer;
 
 pub use board::{Board, BoardError, Connect, ConnectError};

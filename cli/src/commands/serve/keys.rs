@@ -1,0 +1,83 @@
+//! `cantap serve keygen`, and what `--tls` names: who the server is, and whom it believes.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use cantap_serve::Role;
+use cantap_serve::tls::{Files, Keys, Server};
+
+use super::Args;
+use crate::server::role;
+use crate::wrong::wrong;
+
+/// What there is to do beside serving.
+#[derive(clap::Subcommand)]
+pub enum Command {
+    /// Make keys: an authority, the server's, and clients' with what each may do.
+    Keygen {
+        /// Folder for the files; an authority that is in it makes further clients.
+        folder: PathBuf,
+        /// A name or address by which clients reach the server. Can be repeated.
+        #[arg(long = "host", value_name = "HOST")]
+        hosts: Vec<String>,
+        /// A client and what it may do at most: alice:listen, bob:send. Can be repeated.
+        #[arg(long = "client", value_name = "NAME:ROLE", value_parser = named_role)]
+        clients: Vec<(String, Role)>,
+    },
+}
+
+/// Two files' names.
+pub fn two_files(text: &str) -> Result<(PathBuf, PathBuf), String> {
+    let files = text.split_once(',');
+    let files =
+        files.ok_or("give two files, the certificate's and the key's, as server.pem,server-key.pem")?;
+    Ok((files.0.into(), files.1.into()))
+}
+
+fn named_role(text: &str) -> Result<(String, Role), String> {
+    let (name, may) = text.split_once(':').ok_or("write it as NAME:ROLE, as alice:listen")?;
+    Ok((name.to_owned(), role(may)?))
+}
+
+impl Command {
+    /// Makes keys and says which.
+    pub fn run(&self) -> anyhow::Result<ExitCode> {
+        let Self::Keygen { folder, hosts, clients } = self;
+        let has_server = Keys::files(folder, "server").certificate.exists();
+        if !has_server && hosts.is_empty() {
+            return Err(wrong(
+                "name the server's computer with --host, as clients will; repeat it for each name and address",
+            ));
+        }
+        make(folder, hosts, clients)
+    }
+}
+
+fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::Result<ExitCode> {
+    let keys = Keys::in_folder(folder)?;
+    let mut made = Vec::new();
+    if !hosts.is_empty() {
+        made.push(keys.add_server(hosts)?);
+    }
+    for (name, role) in clients {
+        made.push(keys.add_client(name, *role)?);
+    }
+    let mut out = io::stdout().lock();
+    for files in made {
+        writeln!(out, "{}", files.certificate.display())?;
+        writeln!(out, "{}", files.key.display())?;
+    }
+    eprintln!(
+        "cantap: give each client its two files and ca.pem; whoever has ca-key.pem can make clients: keep it where nobody \
+         gets at it"
+    );
+    Ok(ExitCode::SUCCESS)
+}
+
+/// The server's side, as the command line names it.
+pub fn server(args: &Args) -> anyhow::Result<Option<Server>> {
+    let (Some((certificate, key)), Some(authority)) = (&args.tls, &args.clients) else { return Ok(None) };
+    let files = Files { certificate: certificate.clone(), key: key.clone(), authority: authority.clone() };
+    Ok(Some(Server::new(&files)?))
+}

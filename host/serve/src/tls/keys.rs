@@ -1,0 +1,149 @@
+//! A small authority for one server and its clients: `cantap serve keygen`.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::time::SystemTime;
+
+use cantap_wire::message::Role;
+use rcgen::{
+    BasicConstraints, CertificateParams, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
+    KeyUsagePurpose, date_time_ymd,
+};
+
+use super::{Files, name_of};
+
+/// How long certificates are good for.
+const YEARS: i32 = 10;
+/// The server's files are called so.
+const SERVER: &str = "server";
+/// The authority's.
+const AUTHORITY: &str = "ca";
+
+/// Why keys cannot be made.
+#[derive(Debug, thiserror::Error)]
+pub enum KeysError {
+    /// Names of files, and of nothing else.
+    #[error("'{0}' is no name for a key; use letters, digits, - and _")]
+    Name(String),
+    /// Nothing is overwritten.
+    #[error("'{}' is there already; choose another name, or another folder", .0.display())]
+    There(PathBuf),
+    /// A file cannot be written or read.
+    #[error("'{}': {source}", path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// The key or certificate cannot be made.
+    #[error("a certificate cannot be made: {0}")]
+    Certificate(#[from] rcgen::Error),
+}
+
+/// A folder with an authority's key, a server's, and those of clients.
+pub struct Keys {
+    folder: PathBuf,
+    key: KeyPair,
+}
+
+impl Keys {
+    /// The authority in a folder, which is made if there is none. Its key is what makes clients: it is best kept elsewhere.
+    pub fn in_folder(folder: &Path) -> Result<Self, KeysError> {
+        let failed = |source| KeysError::File { path: folder.to_owned(), source };
+        std::fs::create_dir_all(folder).map_err(failed)?;
+        let path = folder.join(format!("{AUTHORITY}-key.pem"));
+        if path.exists() {
+            let text = std::fs::read_to_string(&path)
+                .map_err(|source| KeysError::File { path: path.clone(), source })?;
+            return Ok(Self { folder: folder.to_owned(), key: KeyPair::from_pem(&text)? });
+        }
+        let keys = Self { folder: folder.to_owned(), key: KeyPair::generate()? };
+        let certificate = authority().self_signed(&keys.key)?;
+        keys.write(AUTHORITY, &certificate.pem(), &keys.key)?;
+        Ok(keys)
+    }
+
+    /// Makes the server's certificate, for every name and address by which clients reach it.
+    pub fn add_server(&self, hosts: &[String]) -> Result<Files, KeysError> {
+        self.add(SERVER, hosts.to_vec(), ExtendedKeyUsagePurpose::ServerAuth)
+    }
+
+    /// Makes a client's certificate, which says what it may do at most.
+    pub fn add_client(&self, name: &str, role: Role) -> Result<Files, KeysError> {
+        let is_plain = |letter: char| letter.is_ascii_alphanumeric() || matches!(letter, '-' | '_');
+        if name.is_empty() || !name.chars().all(is_plain) || name.ends_with("-key") {
+            return Err(KeysError::Name(name.to_owned()));
+        }
+        self.add(name, vec![name_of(role)], ExtendedKeyUsagePurpose::ClientAuth)
+    }
+
+    /// The files of one, as they are named here, beside its authority's certificate.
+    pub fn files(folder: &Path, name: &str) -> Files {
+        Files {
+            certificate: folder.join(format!("{name}.pem")),
+            key: folder.join(format!("{name}-key.pem")),
+            authority: folder.join(format!("{AUTHORITY}.pem")),
+        }
+    }
+
+    fn add(
+        &self,
+        name: &str,
+        hosts: Vec<String>,
+        purpose: ExtendedKeyUsagePurpose,
+    ) -> Result<Files, KeysError> {
+        let key = KeyPair::generate()?;
+        let mut params = lasting(CertificateParams::new(hosts)?, name);
+        params.extended_key_usages = vec![purpose];
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        params.use_authority_key_identifier_extension = true;
+        let certificate = params.signed_by(&key, &Issuer::from_params(&authority(), &self.key))?;
+        self.write(name, &certificate.pem(), &key)?;
+        Ok(Self::files(&self.folder, name))
+    }
+
+    fn write(&self, name: &str, certificate: &str, key: &KeyPair) -> Result<(), KeysError> {
+        let files = Self::files(&self.folder, name);
+        for (path, text, is_secret) in
+            [(files.key, key.serialize_pem(), true), (files.certificate, certificate.to_owned(), false)]
+        {
+            create(&path, &text, is_secret).map_err(|source| match source.kind() {
+                io::ErrorKind::AlreadyExists => KeysError::There(path),
+                _ => KeysError::File { path, source },
+            })?;
+        }
+        Ok(())
+    }
+}
+
+/// The same each time it is asked for: what it signs names it by this, and by its key.
+fn authority() -> CertificateParams {
+    let mut params = lasting(CertificateParams::default(), "authority");
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    params
+}
+
+fn lasting(mut params: CertificateParams, name: &str) -> CertificateParams {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    // Whole years are enough, and one before is for clocks that are behind.
+    let year = 1970 + (since.as_secs() / (365 * 86_400 + 86_400 / 4)) as i32;
+    params.not_before = date_time_ymd(year - 1, 1, 1);
+    params.not_after = date_time_ymd(year + YEARS, 1, 1);
+    params.distinguished_name = rcgen::DistinguishedName::new();
+    params.distinguished_name.push(DnType::OrganizationName, "cantap");
+    params.distinguished_name.push(DnType::CommonName, name);
+    params
+}
+
+/// Writes a file that must not be there yet; a secret one for this user alone.
+fn create(path: &Path, text: &str, is_secret: bool) -> io::Result<()> {
+    let mut options = std::fs::OpenOptions::new();
+    options.write(true).create_new(true);
+    #[cfg(unix)]
+    std::os::unix::fs::OpenOptionsExt::mode(&mut options, if is_secret { 0o600 } else { 0o644 });
+    #[cfg(not(unix))]
+    let _ = is_secret;
+    options.open(path)?.write_all(text.as_bytes())
+}

@@ -1,0 +1,189 @@
+//! Clients from other computers: each side shows a certificate of one authority, and a client's says what it may do at most.
+
+mod keys;
+mod stream;
+
+use std::io;
+use std::net::{SocketAddr, TcpStream};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use cantap::device::Link;
+use cantap_wire::message::Role;
+use rustls::pki_types::pem::PemObject;
+use rustls::pki_types::{CertificateDer, DnsName, PrivateKeyDer, ServerName};
+use rustls::server::WebPkiClientVerifier;
+use rustls::{
+    ClientConfig, ClientConnection, Connection, RootCertStore, ServerConfig, ServerConnection, crypto,
+};
+
+use crate::connect::dial;
+use crate::listen::{Listening, accept, admit, bind};
+use crate::{Board, News};
+
+pub use keys::{Keys, KeysError};
+use stream::{Secured, shake_hands};
+
+/// A peer that has not shown its certificate by then is let go.
+const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Peers at a time that have not.
+const MOST_HANDSHAKES: usize = 16;
+
+/// Why TLS cannot be set up, or a peer was not believed.
+#[derive(Debug, thiserror::Error)]
+pub enum TlsError {
+    /// A file is not there or is not what it should be.
+    #[error("'{}' cannot be used: {reason}", path.display())]
+    File {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong with it.
+        reason: String,
+    },
+    /// The certificate and its key do not go together, or the like.
+    #[error("TLS cannot be set up: {0}")]
+    Setup(String),
+    /// The other side cannot be reached, or has gone.
+    #[error(transparent)]
+    Io(#[from] io::Error),
+}
+
+/// The files of one side, in PEM.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Files {
+    /// Its certificate.
+    pub certificate: PathBuf,
+    /// Its private key.
+    pub key: PathBuf,
+    /// The certificate of the authority that the other side's must be of.
+    pub authority: PathBuf,
+}
+
+/// Who a side is and whom it believes, read from files.
+struct Credentials {
+    chain: Vec<CertificateDer<'static>>,
+    key: PrivateKeyDer<'static>,
+    authority: Arc<RootCertStore>,
+}
+
+impl Files {
+    fn read(&self) -> Result<Credentials, TlsError> {
+        let bad = |path: &Path, reason: String| TlsError::File { path: path.to_owned(), reason };
+        let certificates = |path: &Path| {
+            let all: Result<Vec<_>, _> = CertificateDer::pem_file_iter(path).and_then(Iterator::collect);
+            match all {
+                Ok(all) if all.is_empty() => Err(bad(path, "there is no certificate in it".to_owned())),
+                all => all.map_err(|error| bad(path, error.to_string())),
+            }
+        };
+        let mut authority = RootCertStore::empty();
+        for certificate in certificates(&self.authority)? {
+            authority.add(certificate).map_err(|error| bad(&self.authority, error.to_string()))?;
+        }
+        Ok(Credentials {
+            chain: certificates(&self.certificate)?,
+            key: PrivateKeyDer::from_pem_file(&self.key)
+                .map_err(|error| bad(&self.key, error.to_string()))?,
+            authority: Arc::new(authority),
+        })
+    }
+}
+
+fn provider() -> Arc<crypto::CryptoProvider> {
+    Arc::new(crypto::ring::default_provider())
+}
+
+fn setup(error: impl std::fmt::Display) -> TlsError {
+    TlsError::Setup(error.to_string())
+}
+
+/// A server that asks each client for its certificate.
+#[derive(Clone)]
+pub struct Server(Arc<ServerConfig>);
+
+impl Server {
+    /// Reads the files; the authority is the clients'.
+    pub fn new(files: &Files) -> Result<Self, TlsError> {
+        let Credentials { chain, key, authority } = files.read()?;
+        let clients =
+            WebPkiClientVerifier::builder_with_provider(authority, provider()).build().map_err(setup)?;
+        let config = ServerConfig::builder_with_provider(provider())
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .map_err(setup)?
+            .with_client_cert_verifier(clients)
+            .with_single_cert(chain, key)
+            .map_err(setup)?;
+        Ok(Self(Arc::new(config)))
+    }
+}
+
+/// Lets clients in at any address of this computer. Each may do what its certificate says, and `most` at most. Whoever has
+/// none that the authority signed hears nothing.
+pub fn listen(board: &Arc<Board>, address: SocketAddr, most: Role, server: &Server) -> io::Result<Listening> {
+    let (listener, address) = bind(address)?;
+    let (board, config) = (Arc::clone(board), Arc::clone(&server.0));
+    let handshakes = Arc::new(());
+    Listening::start("cantap-tls", Some(address), move || {
+        let (stream, peer) = accept(&listener)?;
+        let name = format!("client {peer}");
+        if Arc::strong_count(&handshakes) > MOST_HANDSHAKES {
+            // Told to nobody: a flood would be a flood of messages.
+            return Ok(());
+        }
+        let (board, config, counted) = (Arc::clone(&board), Arc::clone(&config), Arc::clone(&handshakes));
+        std::thread::Builder::new().name("cantap-tls-client".to_owned()).spawn(move || {
+            let secured = welcome(stream, config);
+            drop(counted);
+            match secured {
+                Ok((role, secured)) => {
+                    let (input, output) = secured.split();
+                    admit(&board, input, output, &name, role.min(most));
+                }
+                Err(error) => board.tell(News::Refused { client: name, reason: error.to_string() }),
+            }
+        })?;
+        Ok(())
+    })
+}
+
+fn welcome(stream: TcpStream, config: Arc<ServerConfig>) -> io::Result<(Role, Secured)> {
+    let connection = ServerConnection::new(config).map_err(io::Error::other)?;
+    let secured = shake_hands(stream, Connection::Server(connection), Instant::now() + HANDSHAKE_TIMEOUT)?;
+    let role = secured.peer_certificate().and_then(|certificate| role_of(&certificate));
+    let role = role.ok_or_else(|| io::Error::other("its certificate says nothing of what it may do"))?;
+    Ok((role, secured))
+}
+
+/// The name that a client's certificate has for a role: one that no computer has.
+fn name_of(role: Role) -> String {
+    format!("{role}.role.cantap.invalid")
+}
+
+/// What a client's certificate, which the authority has signed, lets it do.
+fn role_of(certificate: &CertificateDer<'_>) -> Option<Role> {
+    let certificate = webpki::EndEntityCert::try_from(certificate).ok()?;
+    Role::ALL.into_iter().rev().find(|role| {
+        DnsName::try_from(name_of(*role)).is_ok_and(|name| {
+            certificate.verify_is_valid_for_subject_name(&ServerName::DnsName(name)).is_ok()
+        })
+    })
+}
+
+/// Connects to a server at `HOST:PORT`, whose certificate must be for that host.
+pub fn connect(address: &str, files: &Files) -> Result<Link, TlsError> {
+    let Credentials { chain, key, authority } = files.read()?;
+    let config = ClientConfig::builder_with_provider(provider())
+        .with_protocol_versions(&[&rustls::version::TLS13])
+        .map_err(setup)?
+        .with_root_certificates(authority)
+        .with_client_auth_cert(chain, key)
+        .map_err(setup)?;
+    let host = address.rsplit_once(':').map_or(address, |(host, _)| host).trim_matches(['[', ']']);
+    let host = ServerName::try_from(host.to_owned()).map_err(setup)?;
+    let connection = ClientConnection::new(Arc::new(config), host).map_err(setup)?;
+    let stream = dial(address)?;
+    let secured = shake_hands(stream, Connection::Client(connection), Instant::now() + HANDSHAKE_TIMEOUT)?;
+    let (reader, writer) = secured.split();
+    Ok(Link::new(reader, writer))
+}

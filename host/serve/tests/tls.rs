@@ -1,0 +1,153 @@
+//! Clients from other computers: who shows which certificate may do what, and who shows none hears nothing.
+#![cfg(feature = "tls")]
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use cantap::wire::Refusal;
+use cantap::wire::message::{ChannelConfig, Mode, Role};
+use cantap::{Channel, Device, DeviceError};
+use cantap_serve::listen::Listening;
+use cantap_serve::tls::{self, Files, Keys};
+use cantap_serve::{Board, Settings};
+
+const BITRATE_BPS: u32 = 500_000;
+
+struct Served {
+    board: Arc<Board>,
+    listening: Listening,
+    said: Arc<Mutex<Vec<String>>>,
+}
+
+fn serve(folder: &Path, most: Role) -> Served {
+    let options: cantap_virtual::Options = "load=60".parse().unwrap();
+    let connect = Box::new(move |_: Option<&str>| Ok(cantap_virtual::start(options.clone())?.into_link()));
+    let said = Arc::new(Mutex::new(Vec::new()));
+    let told = Arc::clone(&said);
+    let tell = move |news: cantap_serve::News| told.lock().unwrap().push(news.to_string());
+    let board = Arc::new(Board::start("board", connect, Settings::at(BITRATE_BPS), tell).unwrap());
+    let keys = Keys::in_folder(folder).unwrap();
+    let files = keys.add_server(&["localhost".to_owned(), "127.0.0.1".to_owned()]).unwrap();
+    let server = tls::Server::new(&files).unwrap();
+    let listening = tls::listen(&board, "127.0.0.1:0".parse().unwrap(), most, &server).unwrap();
+    Served { board, listening, said }
+}
+
+impl Served {
+    fn connect(&self, host: &str, files: &Files) -> Result<Device, String> {
+        let address = format!("{host}:{}", self.listening.address().unwrap().port());
+        let link = tls::connect(&address, files).map_err(|error| error.to_string())?;
+        Device::over(link, "far").map_err(|error| error.to_string())
+    }
+}
+
+fn normal(device: &Device) -> Result<ChannelConfig, DeviceError> {
+    let config = ChannelConfig::listen_only(device.timing(BITRATE_BPS)?);
+    device.open_channel(Channel::Can1, Some(ChannelConfig { mode: Mode::Normal, ..config }))
+}
+
+fn refuses_to_send(device: &Device) {
+    let refused = normal(device);
+    let is_role =
+        matches!(refused, Err(DeviceError::Refused { refusal: Refusal::NotGranted { needs: Role::Send } }));
+    assert!(is_role, "{refused:?}");
+}
+
+#[test]
+fn a_capture_over_tls_is_one_made_beside_it_and_the_certificate_says_what_is_allowed() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Send);
+    // Clients are added later, by the authority that is there.
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let listener = keys.add_client("listener", Role::Listen).unwrap();
+    let sender = keys.add_client("sender", Role::Send).unwrap();
+    let beside = Device::over(served.board.link("near", Role::Listen).unwrap(), "near").unwrap();
+    let far = served.connect("localhost", &listener).unwrap();
+    for device in [&beside, &far] {
+        device.listen(Channel::Can1, BITRATE_BPS).unwrap();
+    }
+    std::thread::sleep(Duration::from_millis(500));
+    let frames = |device: &Device| {
+        device.stop().unwrap();
+        let counters = device.counters().channels[0];
+        assert_eq!(counters.lost(), 0, "{counters:?}");
+        let all = device.records().filter_map(|record| Some(record.unwrap().frame()?.to_string()));
+        all.collect::<Vec<_>>()
+    };
+    let refused = normal(&far);
+    assert!(matches!(refused, Err(DeviceError::Refused { refusal: Refusal::ChannelOpen })), "{refused:?}");
+    let (far_frames, near_frames) = (frames(&far), frames(&beside));
+    let at = near_frames.windows(8).position(|window| window == &far_frames[..8]).expect("common frames");
+    let common = far_frames.len().min(near_frames.len() - at);
+    assert!(common > 100, "{common}");
+    assert_eq!(far_frames[..common], near_frames[at..at + common]);
+    refuses_to_send(&served.connect("localhost", &listener).unwrap());
+    normal(&served.connect("127.0.0.1", &sender).unwrap()).unwrap();
+}
+
+#[test]
+fn the_server_grants_no_more_than_it_was_told_to() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Listen);
+    let sender = Keys::in_folder(folder.path()).unwrap().add_client("sender", Role::Send).unwrap();
+    let device = served.connect("localhost", &sender).unwrap();
+    refuses_to_send(&device);
+    device.listen(Channel::Can1, BITRATE_BPS).unwrap();
+}
+
+#[test]
+fn strangers_and_wrong_certificates_hear_nothing() {
+    let (folder, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    let served = serve(folder.path(), Role::Send);
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let good = keys.add_client("good", Role::Listen).unwrap();
+    let foreign = Keys::in_folder(other.path()).unwrap().add_client("good", Role::Send).unwrap();
+    // Another authority's client; a server that is not of the authority the client believes; a server's key as a client's.
+    let of_stranger = Files { authority: good.authority.clone(), ..foreign.clone() };
+    let of_server = Keys::files(folder.path(), "server");
+    for files in [&of_stranger, &foreign, &of_server] {
+        let refused = served.connect("localhost", files);
+        assert!(refused.is_err(), "{files:?}");
+    }
+    // A name that the server's certificate does not have.
+    assert!(served.connect("127.0.0.2", &good).is_err());
+    // Plain text, nothing, and a flood: not one byte of ours before the peer has shown who it is.
+    let address = served.listening.address().unwrap();
+    let mut plain = TcpStream::connect(address).unwrap();
+    plain.write_all(&[0, 2, 1, 6, 3, 0x9f, 0xe2, 0x8a, 0x67, 0]).unwrap();
+    let flood: Vec<TcpStream> = (0..100).map(|_| TcpStream::connect(address).unwrap()).collect();
+    let started = Instant::now();
+    for mut stream in std::iter::once(plain).chain(flood) {
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let mut heard = Vec::new();
+        // Ended or cut; an alert of TLS at most, which is seven bytes.
+        let _ = stream.read_to_end(&mut heard);
+        assert!(heard.len() <= 7, "{heard:?}");
+    }
+    assert!(started.elapsed() < Duration::from_secs(9), "{:?}", started.elapsed());
+    assert_eq!(served.board.clients(), 0);
+    served.connect("localhost", &good).unwrap();
+    let said = served.said.lock().unwrap().join("\n");
+    assert!(said.contains("was not let in"), "{said}");
+}
+
+#[test]
+fn keys_are_secret_and_nothing_is_overwritten() {
+    let folder = tempfile::tempdir().unwrap();
+    let keys = Keys::in_folder(folder.path()).unwrap();
+    let files = keys.add_client("alice", Role::Listen).unwrap();
+    #[cfg(unix)]
+    for key in [files.key, folder.path().join("ca-key.pem")] {
+        use std::os::unix::fs::PermissionsExt;
+        assert_eq!(std::fs::metadata(key).unwrap().permissions().mode() & 0o777, 0o600);
+    }
+    assert!(keys.add_client("alice", Role::Send).unwrap_err().to_string().contains("is there already"));
+    for name in ["", "../x", "a b", "ca-key"] {
+        assert!(keys.add_client(name, Role::Listen).is_err(), "{name}");
+    }
+    let missing = Keys::files(folder.path(), "nobody");
+    assert!(tls::Server::new(&missing).err().unwrap().to_string().contains("nobody.pem' cannot be used"));
+}

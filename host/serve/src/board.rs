@@ -395,7 +395,9 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
         Decoded::Ended { reason, .. } => {
             heard.end = Some(match reason {
                 EndReason::Configured => SessionOver::Configured,
-                EndReason::Suspended | EndReason::BoardLost | EndReason::ServerEnded => SessionOver::Suspended,
+                EndReason::Suspended | EndReason::BoardLost | EndReason::ServerEnded => {
+                    SessionOver::Suspended
+                }
             });
         }
         Decoded::Corrupt(Corruption::OutOfOrder { .. }) => heard.end = Some(SessionOver::StreamWentBack),

@@ -215,3 +215,40 @@ fn an_aborted_queue_costs_the_other_channel_no_frame() {
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
     assert_eq!(rig.ledger.losses(Can2).total(), 0);
 }
+
+/// Frames with times so close that each is waited for rather than left to the alarm: the longest that one call can last.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
+    for spacing_us in [5, 7, 9, 10, 11, 13] {
+        let mut rig = connected(Worst);
+        for channel in Channel::ALL {
+            open_normal(&mut rig, channel, true);
+        }
+        let first = rig.status().unwrap().ticks + u64::from(8_000 * TICKS_PER_US);
+        for channel in Channel::ALL {
+            for burst in 0..4 {
+                // As many as there are mailboxes, in turn with the other channel's.
+                let at = |n: u64| {
+                    let nth = 2 * n + channel.index() as u64;
+                    first + (burst * 2_000 + nth * spacing_us) * u64::from(TICKS_PER_US)
+                };
+                let frames = (0..3)
+                    .map(|n| TxFrame { tag: n, frame: frame("155#"), at_ticks: Some(at(n.into())) })
+                    .collect();
+                rig.ask(Command::Send { channel, frames }).unwrap();
+            }
+        }
+        rig.machine.reset_probe();
+        let from = rig.now();
+        rig.run_for(20 * MS).unwrap();
+        let status = rig.status().unwrap();
+        assert_eq!(status.channels.map(|channel| channel.transmitted), [12; 2], "{spacing_us} us");
+        for Task { name, longest_us, .. } in rig.machine.tasks(rig.now() - from) {
+            if PRIORITY_4.contains(&name.as_str()) {
+                eprintln!("{spacing_us} us: {name} at most {longest_us:.1} us");
+                assert!(longest_us <= LONGEST_CALL_US, "{spacing_us} us: {name} took {longest_us:.1} us");
+            }
+        }
+    }
+}

@@ -316,7 +316,7 @@ impl FakeDevice {
             let fault = if is_bad || turned { fault } else { Fault::None };
             if fault != Fault::None && !std::mem::replace(&mut turned, true) {
                 match fault {
-                    Fault::SessionLost => greeted = false,
+                    Fault::SessionLost | Fault::Configured => greeted = false,
                     Fault::Stolen => {
                         self.begin_session();
                         let strangers_id = self.strangers_id;
@@ -326,7 +326,6 @@ impl FakeDevice {
                         greeted = false;
                         self.end_session(EndReason::Suspended);
                     }
-                    Fault::Configured => greeted = false,
                     Fault::GoesBack => self.batch.restart(),
                     _ => {}
                 }

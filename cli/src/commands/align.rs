@@ -143,7 +143,7 @@ fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
         match read {
             Ok(()) => batch.iter().for_each(|record| sketch.add(record)),
             Err(issue) if args.strict => bail!(issue),
-            // It is told when the trace is read again.
+            // It is reported when the trace is read again.
             Err(_) => {}
         }
     }

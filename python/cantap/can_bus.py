@@ -146,6 +146,8 @@ class CantapBus(can.BusABC):
     # Receiving
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._is_shutdown:
+            raise can.CanOperationError(f"{self.channel_info} is shut down")
         try:
             found = self._records._message(timeout)
         except DeviceError as error:

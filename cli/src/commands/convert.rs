@@ -207,7 +207,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         output.map_or(Ok(()), TraceOutput::give_up)?;
         return Err(error);
     }
-    // An empty trace is one all the same.
+    // An empty trace is still a trace.
     let output = output.map_or_else(create, Ok)?;
     let mut left_out = output.finish()?;
     if args.json {

@@ -287,9 +287,9 @@ fn what_is_sent_is_completed_from_the_database() {
     assert_eq!(app.message, "Brake  OilTemp  Speed");
     press(&mut app, &mut model, "s");
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
-    press(&mut app, &mut model, "30,");
+    press(&mut app, &mut model, "30,o");
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
     press(&mut app, &mut model, "5 100ms\n");
     assert_eq!(app.send[0].text, "Engine:Speed=30,OilTemp=5 100ms");
-    assert_eq!(app.send[0].frame.to_string(), "100#1E05");
+    assert_eq!(app.send[0].frame.to_string(), "100#1E0500");
 }

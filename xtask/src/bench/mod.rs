@@ -16,6 +16,8 @@ mod extent;
 #[cfg(feature = "bench")]
 mod formats;
 #[cfg(feature = "bench")]
+mod graph;
+#[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
 mod memory;
@@ -57,6 +59,8 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// Redraws of the live view's graph with five million values in the window.
+    Graph,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
 }
@@ -116,6 +120,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Graph => graph::run()?,
             Subject::Monitor => monitor::run(args.seconds)?,
         }
     }

@@ -100,7 +100,7 @@ struct Client {
     id: ClientId,
     role: Role,
     name: String,
-    /// Nobody is told of those who only knock.
+    /// Those who only knock are not reported to anybody.
     has_greeted: Arc<AtomicBool>,
     outbox: Arc<Outbox>,
 }

@@ -61,14 +61,13 @@ impl Memory {
     /// Frames as text, errors as what they say.
     fn told(&self) -> Vec<String> {
         let told = self.told.lock().unwrap();
-        let text = |raw: &RawFrame| match frame_of(raw) {
-            Some(frame) => frame.to_string(),
-            None => {
-                let id = u32::from_ne_bytes([raw[0], raw[1], raw[2], raw[3]]);
-                let frame =
-                    ErrorFrame { classes: id & !ERROR_FLAG, data: std::array::from_fn(|at| raw[8 + at]) };
-                format!("{:?}", frame.events().0)
+        let text = |raw: &RawFrame| {
+            if let Some(frame) = frame_of(raw) {
+                return frame.to_string();
             }
+            let id = u32::from_ne_bytes([raw[0], raw[1], raw[2], raw[3]]);
+            let frame = ErrorFrame { classes: id & !ERROR_FLAG, data: std::array::from_fn(|at| raw[8 + at]) };
+            format!("{:?}", frame.events().0)
         };
         told.iter().map(text).collect()
     }

@@ -8,9 +8,9 @@ use cantap_wire::{Channel, Command, Refusal, Reply};
 use super::Client;
 use crate::state::{Table, Then, clears};
 
-/// Frames that are given up have been told by then.
+/// Frames that are given up have been reported by then.
 const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
-/// A client whose frames find the board's queue full, perhaps of another's, waits so long before it is told.
+/// A client whose frames find the board's queue full, perhaps of another's, waits this long before it is refused.
 const ROOM_TIMEOUT: Duration = Duration::from_millis(800);
 
 impl Client {
@@ -59,7 +59,7 @@ impl Client {
         }
     }
 
-    /// Takes the client's frames out of the board's queue. What others have in it is sent all the same.
+    /// Takes the client's frames out of the board's queue. What others have in it is still sent.
     pub(super) fn withdraw(&self, channel: Channel, is_closed: bool) -> Result<(), Refusal> {
         {
             let mut state = self.shared.state();

@@ -47,7 +47,7 @@ const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
 const KEEP_ALIVE: &str = "< echo >";
 /// A client that has not opened a bus by then is let go.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
-/// A client that takes nothing for so long is gone.
+/// A client that takes nothing for this long is gone.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Connections at a time, those that have not opened a bus among them.
 const MOST_CONNECTIONS: usize = 32;

@@ -26,9 +26,17 @@ listen() {
   done
   sleep 0.5
 }
+# quiet: waits until no frame crosses any more. (A session has bytes on the wire all the time.)
+quiet() {
+  _before=none
+  while _now="$(both taken) $(both sent)" && [ "$_before" != "$_now" ]; do
+    _before=$_now
+    sleep 1
+  done
+}
 # heard: waits until nothing more comes.
 heard() {
-  settled
+  quiet
   sleep 0.5
   # shellcheck disable=SC2086 # several
   kill $LISTENERS
@@ -77,16 +85,23 @@ listen bus0 bus1
 board mark
 sleep 6
 board dump bridge
-heard
+board traffic 0 std0
+sleep 1
+# shellcheck disable=SC2086 # several
+kill $LISTENERS
+# shellcheck disable=SC2086
+wait $LISTENERS 2> /dev/null
 _bad=0
 for _n in 1 2; do
   frames bus$((_n - 1)).txt > got$_n
-  # What crossed before candump listened, and after the books were read, is not compared.
-  _first=$(sed -n 20p got$_n)
-  _second=$(sed -n 21p got$_n)
-  awk -v a="$_first" -v b="$_second" 'last == a && $0 == b { on = 1; print last } on { print } { last = $0 }' < /share/bridge.taken$_n | bare > want$_n
+  bare < /share/bridge.taken$_n > want$_n
   _count=$(wc -l < want$_n)
-  tail -n +20 got$_n | head -n "$_count" | cmp -s - want$_n || _bad=1
+  # candump listened before the books were begun, and longer.
+  awk -v want="$(head -n 8 want$_n | tr '\n' ' ')" '
+    on { print; next }
+    { last[NR % 8] = $0; line = ""; for (i = 1; i <= 8; i++) line = line last[(NR + i) % 8] " " }
+    line == want { on = 1; for (i = 1; i <= 8; i++) print last[(NR + i) % 8] }
+  ' < got$_n | head -n "$_count" | cmp -s - want$_n || _bad=1
   [ "$_count" -gt 1000 ] || _bad=1
 done
 verdict $_bad "bridge, candump: both channels at 100 %, shortest frames" "$(wc -l < want1) + $(wc -l < want2) frames in order"
@@ -133,7 +148,7 @@ verdict $? "bridge, cangen against 60 %: each frame once" "$(wc -l < /share/brid
 listen bus0
 board noise 30
 board play 1 50 mix 300
-settled
+quiet
 board noise 0
 board acknowledge no
 cansend bus0 123#22
@@ -147,8 +162,9 @@ cat > program.py << 'PROGRAM'
 import can, sys
 bus = can.Bus(interface="socketcan", channel="bus0")
 print("ready", flush=True)
-frames = [bus.recv(30) for _ in range(300)]
-assert all(frame is not None and not frame.is_error_frame for frame in frames), frames
+# As many as fit its socket.
+frames = [bus.recv(30) for _ in range(150)]
+assert all(frame is not None and not frame.is_error_frame for frame in frames), len([frame for frame in frames if frame])
 assert any(frame.is_extended_id for frame in frames) and any(frame.dlc == 0 for frame in frames)
 for number in range(20):
     bus.send(can.Message(arbitration_id=0x1ABBCC00 + number, data=[number, 0xFF], is_extended_id=True))
@@ -161,12 +177,12 @@ if python3 -c "import can" 2> python.err; then
   python3 program.py > python.out 2> python.err &
   _python=$!
   wait_until grep -q ready python.out || wait_until grep -q ready python.out
-  board play 1 50 mix 300
+  board play 1 50 mix 150
   wait $_python
   sleep 1
   board dump bridge
   grep -q done python.out && [ "$(grep -c '^1ABBCC[01].#' /share/bridge.sent1)" = 20 ]
-  verdict $? "bridge, python-can: hears 300 frames and sends 20"
+  verdict $? "bridge, python-can: hears 150 frames and sends 20"
   cat python.err
 else
   echo "SKIPPED: this guest has no python-can: $(tail -n 1 python.err)"

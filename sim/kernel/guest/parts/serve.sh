@@ -24,8 +24,9 @@ client -t 2
 wait "$CAPTURE"
 exact "a capture through the server"
 
+board mark
 client
-sleep 1
+wait_until is_flowing && sleep 1
 [ "$(both dominant_bits)" != "0 0" ]
 verdict $? "serve: the client's board acknowledges" "$(both dominant_bits) dominant bits"
 kill -9 "$SERVER"

@@ -14,7 +14,7 @@ const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshar
 /// machine's.
 const SSH_SERVER: (&str, &str) = ("/usr/sbin/sshd", "openssh-server");
 /// Python packages, with their versions.
-const REQUIREMENTS: &str = "xtask/peers.txt";
+pub const REQUIREMENTS: &str = "xtask/peers.txt";
 
 /// Where the peers are.
 pub struct Peers {

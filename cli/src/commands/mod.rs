@@ -3,6 +3,8 @@
 pub mod align;
 pub mod autobaud;
 pub mod bits;
+#[cfg(target_os = "linux")]
+pub mod bridge;
 pub mod capture;
 pub mod care;
 pub mod completions;
@@ -76,6 +78,9 @@ pub enum Command {
     /// Run a virtual device behind a pseudo terminal.
     #[cfg(unix)]
     Virtual(virtual_device::Args),
+    /// Carry a device's channels to and from CAN interfaces of Linux: SocketCAN.
+    #[cfg(target_os = "linux")]
+    Bridge(bridge::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
     /// Show a device's state: counters, errors, queue, temperature, registers.
@@ -127,6 +132,8 @@ impl Command {
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
+            #[cfg(target_os = "linux")]
+            Self::Bridge(args) => bridge::run(&args),
             Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),

@@ -23,6 +23,8 @@ mod host;
 mod memory;
 #[cfg(feature = "bench")]
 mod monitor;
+#[cfg(all(feature = "bench", unix))]
+mod serve;
 #[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
@@ -63,6 +65,8 @@ enum Subject {
     Graph,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
+    /// A shared board: eight clients on two saturated channels, two of them slow.
+    Serve,
 }
 
 /// What `cargo xtask bench` takes.
@@ -70,7 +74,7 @@ enum Subject {
 pub struct Args {
     /// What to measure; everything if not given.
     subject: Vec<Subject>,
-    /// How long the live view is watched.
+    /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
     /// Of what is measured on the emulated board, only the rows whose names contain this.
@@ -122,6 +126,12 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Stats => stats::run()?,
             Subject::Graph => graph::run()?,
             Subject::Monitor => monitor::run(args.seconds)?,
+            #[cfg(unix)]
+            Subject::Serve => serve::run(args.seconds)?,
+            #[cfg(not(unix))]
+            Subject::Serve => {
+                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+            }
         }
     }
     Ok(())

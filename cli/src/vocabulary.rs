@@ -131,7 +131,8 @@ fn what_measures_or_tells_has_json() {
     }
     without.sort();
     // They write scripts or files, act, serve, or show a screen.
-    let expected = ["completions", "identify", "man", "monitor", "reset", "serve", "update", "virtual"]
-        .map(str::to_owned);
+    let expected =
+        ["completions", "extcap", "identify", "man", "monitor", "reset", "serve", "update", "virtual"]
+            .map(str::to_owned);
     assert_eq!(without, expected);
 }

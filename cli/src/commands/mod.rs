@@ -13,6 +13,7 @@ pub mod decode;
 pub mod defaults;
 pub mod demo;
 pub mod diff;
+pub mod extcap;
 pub mod r#gen;
 pub mod info;
 pub mod list;
@@ -78,6 +79,8 @@ pub enum Command {
     Virtual(virtual_device::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
+    /// Be interfaces of Wireshark: `cantap extcap install`.
+    Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
     /// Test a board: everything that it can show by itself, and a report to send in.
@@ -127,6 +130,7 @@ impl Command {
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
+            Self::Extcap(args) => extcap::run(*args),
             Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),

@@ -31,7 +31,7 @@ pub struct LiveArgs {
     /// repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
-    /// Listen only for so long, as 10, 500ms or 2m.
+    /// How long to listen, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
 }
@@ -39,7 +39,7 @@ pub struct LiveArgs {
 /// How often to check whether to go on while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-/// A device that the command goes on with when it is back; errors are told to the user.
+/// A device that the command goes on with when it is back; errors are shown to the user.
 pub type Line = Reconnecting<OpenDevice, anyhow::Error>;
 /// Several of them.
 pub type Lines = Several<OpenDevice, anyhow::Error>;
@@ -62,18 +62,18 @@ pub struct LiveRecords {
     lines: Lines,
     addresses: Vec<Address>,
     ends: Option<Instant>,
-    /// Devices that have been away for so long are not waited for.
+    /// Devices that have been away for this long are not waited for.
     give_up_after: Option<Duration>,
     /// How stopping went.
     stopped: Option<anyhow::Result<()>>,
     hearing: Hearing,
     /// Frames may be there although none is heard, so that silence says nothing.
     is_filtered: bool,
-    /// Who is told what happens; else it is said on standard error.
-    teller: Option<Teller>,
+    /// Takes what happens, instead of standard error.
+    reporter: Option<Reporter>,
 }
 
-type Teller = Box<dyn FnMut(&str)>;
+type Reporter = Box<dyn FnMut(&str)>;
 
 impl LiveArgs {
     /// The devices that were given.
@@ -127,23 +127,23 @@ impl LiveRecords {
             stopped: None,
             hearing: Hearing::default(),
             is_filtered: !filters.is_empty(),
-            teller: None,
+            reporter: None,
         })
     }
 
-    /// Has what happens to devices and channels told there, in place of standard error.
-    pub fn tell_to(&mut self, teller: impl FnMut(&str) + 'static) {
-        self.teller = Some(Box::new(teller));
+    /// Reports what happens to devices and channels there, instead of on standard error.
+    pub fn report_to(&mut self, reporter: impl FnMut(&str) + 'static) {
+        self.reporter = Some(Box::new(reporter));
     }
 
-    fn tell(&mut self, text: &str) {
-        match &mut self.teller {
-            Some(teller) => teller(text),
+    fn report(&mut self, text: &str) {
+        match &mut self.reporter {
+            Some(reporter) => reporter(text),
             None => eprintln!("cantap: {text}"),
         }
     }
 
-    /// Ends with an error when every device has been away for so long.
+    /// Ends with an error when every device has been away for this long.
     pub fn give_up_after(&mut self, time: Option<Duration>) {
         self.give_up_after = time;
     }
@@ -260,13 +260,13 @@ impl LiveRecords {
                     ),
                     None => "it goes on when the device is back, and Ctrl-C ends it".to_owned(),
                 };
-                self.tell(&format!("{reason}; {rest}"));
+                self.report(&format!("{reason}; {rest}"));
             }
             Happening::Gone(error) => return Err(error),
             Happening::Back(back) => {
                 let name = (self.addresses.len() > 1).then(|| &self.addresses[board]);
                 let said = welcome(board, name, &back);
-                self.tell(&said);
+                self.report(&said);
             }
             Happening::Ended => {
                 records.clear();
@@ -285,8 +285,8 @@ impl LiveRecords {
         self.hearing.take(records, now);
         for number in self.hearing.news(now) {
             let said = self.errors_only(number);
-            match &mut self.teller {
-                Some(teller) => teller(&said),
+            match &mut self.reporter {
+                Some(reporter) => reporter(&said),
                 None => stderr::warn(&said),
             }
         }

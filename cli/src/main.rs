@@ -94,7 +94,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is told as
+/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is reported as
 /// what is wrong with a condition, in one line.
 fn leave(error: &clap::Error) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());

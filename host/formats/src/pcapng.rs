@@ -4,7 +4,7 @@
 //! while it is read, reading must go on behind a damaged block, and times may lie before 1970. Each
 //! channel is an interface `can0`, `can1`…; what is not a frame is an error frame as SocketCAN has
 //! them. A loss is also a drop count and a comment, and what a channel had and lost altogether is in statistics blocks: at the end, and
-//! every so often for somebody who reads meanwhile.
+//! regularly for somebody who reads meanwhile.
 
 mod decode;
 mod encode;
@@ -166,7 +166,7 @@ mod tests {
     }
 
     #[test]
-    fn whoever_reads_along_has_the_head_at_once_and_the_counts_every_so_often() {
+    fn whoever_reads_along_has_the_head_at_once_and_the_counts_regularly() {
         let channels = [1, 2].map(|channel| ChannelInfo {
             channel,
             bitrate_bps: Some(500_000),

@@ -24,8 +24,8 @@ pub struct WriteOptions {
     /// What is known of the channels, for formats that have a place for it. Those that are here are in the file even if they carry
     /// nothing, as far as the format can say so.
     pub channels: Vec<ChannelInfo>,
-    /// For somebody who reads while it is written: [`TraceWriter::flush`] writes the head even before the first record, and so often,
-    /// in formats that have a place for it, how many frames each channel had and lost by then.
+    /// For somebody who reads while it is written, in formats that have a place for it: [`TraceWriter::flush`] writes the head even
+    /// before the first record, and at this interval how many frames each channel has had and lost.
     pub statistics_every: Option<Duration>,
 }
 

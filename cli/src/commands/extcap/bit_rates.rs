@@ -52,12 +52,12 @@ impl FromStr for BitRate {
     }
 }
 
-/// The channels to capture, by number, and the bit rates that have to be given for them. Says by `tell` what it does. A silent channel
+/// The channels to capture, by number, and the bit rates that have to be given for them. Reports what it does. A silent channel
 /// is left out if another one speaks.
 pub fn settle(
     wanted: [BitRate; 2],
     address: &Address,
-    tell: &mut dyn FnMut(&str),
+    report: &mut dyn FnMut(&str),
 ) -> anyhow::Result<(Vec<u8>, Vec<ChannelBitrate>)> {
     let mut channels = Vec::new();
     let mut rates = Vec::new();
@@ -77,17 +77,17 @@ pub fn settle(
                     None => device.insert(address.open()?),
                 };
                 if device.defaults(channel)?.is_none() {
-                    tell(&format!("channel {number}: listening for its bit rate"));
+                    report(&format!("channel {number}: listening for its bit rate"));
                     match autobaud::search(device, channel, &Limits::default(), &mut |_| {
                         !interrupt::requested()
                     })? {
                         Outcome::Found { bitrate_bps, .. } => {
-                            tell(&format!("channel {number}: {bitrate_bps} bit/s found"));
+                            report(&format!("channel {number}: {bitrate_bps} bit/s found"));
                             rates.push(rate(bitrate_bps));
                         }
                         outcome => {
                             let reason = failure(outcome, channel, Limits::default().silence.as_secs_f64());
-                            tell(&format!("{reason}; it is not captured"));
+                            report(&format!("{reason}; it is not captured"));
                             reasons.push(reason);
                             continue;
                         }

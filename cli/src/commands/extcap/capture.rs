@@ -24,13 +24,13 @@ use crate::{advice, args, exit, interrupt};
 
 /// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once.
 const FLUSH_EVERY: Duration = Duration::from_millis(50);
-/// How often Wireshark is told how many frames each channel has had and lost. A reader that is gone is noticed by then at the latest.
+/// How often Wireshark learns how many frames each channel has had and lost. A reader that is gone is noticed by then at the latest.
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
 /// Wireshark opens its pipe within this time, or never.
 const PIPE_PATIENCE: Duration = Duration::from_secs(30);
 /// After a failure it opens it within this time.
 const GRACE: Duration = Duration::from_secs(3);
-/// So long after the request to end, the program ends even if its last words are not taken: the board falls silent with it.
+/// This long after the request to end, the program ends even if nobody takes its last words: the board falls silent with it.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 
 /// What is asked for.
@@ -68,9 +68,9 @@ fn end_anyway() {
 
 fn open(wanted: &Wanted, pipe: &Opening) -> anyhow::Result<()> {
     let screen = &wanted.toolbar.screen;
-    let mut tell = |text: &str| screen.tell(text);
+    let mut report = |text: &str| screen.report(text);
     let address = wanted.address.as_ref().map_err(|error| anyhow::anyhow!("{error}"))?;
-    let (channels, rates) = settle(wanted.bit_rates, address, &mut tell)?;
+    let (channels, rates) = settle(wanted.bit_rates, address, &mut report)?;
     let numbers: Vec<String> = channels.iter().map(u8::to_string).collect();
     let channels = args::channels(&numbers.join(",")).map_err(anyhow::Error::msg)?;
     let boards = Boards::new(std::slice::from_ref(address), &channels)?;
@@ -90,7 +90,7 @@ fn open(wanted: &Wanted, pipe: &Opening) -> anyhow::Result<()> {
     };
     if screen.is_there() {
         let screen = screen.clone();
-        live.tell_to(move |text| screen.tell(text));
+        live.report_to(move |text| screen.report(text));
     }
     let options = WriteOptions {
         format: Some(Format::Pcapng),
@@ -194,7 +194,7 @@ impl Capture<'_> {
     fn change(&mut self, change: Change) {
         let screen = &self.wanted.toolbar.screen;
         let Some((_, device)) = self.live.lines().devices().next() else {
-            screen.tell("the device is not there; nothing was changed");
+            screen.report("the device is not there; nothing was changed");
             return;
         };
         let clock_hz = device.hello().can_clock_hz;
@@ -216,10 +216,10 @@ impl Capture<'_> {
             match reopened {
                 Ok(changed) => {
                     let how = format!("from here on {}", channel_args::description(&changed, clock_hz));
-                    screen.tell(&format!("channel {number}: {how}"));
+                    screen.report(&format!("channel {number}: {how}"));
                     self.remarks.push((number, now_ns(), how));
                 }
-                Err(error) => screen.tell(&format!("channel {number}: {}", advice::told(&error))),
+                Err(error) => screen.report(&format!("channel {number}: {}", advice::told(&error))),
             }
         }
         self.show_channels();

@@ -168,7 +168,7 @@ impl Screen {
     }
 
     /// Says something in the status bar and in the log.
-    pub fn tell(&self, text: &str) {
+    pub fn report(&self, text: &str) {
         self.send(NO_CONTROL, STATUS, text);
         self.log(text);
     }

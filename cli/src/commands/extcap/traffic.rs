@@ -24,10 +24,10 @@ struct OfChannel {
     is_at_least: bool,
     /// Since it was last shown, in words.
     losses: Vec<String>,
-    untold: u64,
+    unlisted: u64,
 }
 
-/// So many losses are listed one by one between two looks at the toolbar, and the rest as a number.
+/// This many losses are listed one by one between two looks at the toolbar, and the rest as a number.
 const MOST_LISTED: usize = 8;
 
 impl Traffic {
@@ -49,7 +49,7 @@ impl Traffic {
                     let count = amount(u64::from(count), at_least);
                     channel.losses.push(format!("{count} lost ({place})"));
                 } else {
-                    channel.untold += u64::from(count);
+                    channel.unlisted += u64::from(count);
                 }
             }
             _ => {}
@@ -68,10 +68,10 @@ impl Traffic {
             for loss in channel.losses.drain(..) {
                 screen.log(&format!("{seconds:.0} s, channel {number}: {loss}"));
             }
-            if channel.untold > 0 {
-                screen.log(&format!("{seconds:.0} s, channel {number}: {} more lost", channel.untold));
+            if channel.unlisted > 0 {
+                screen.log(&format!("{seconds:.0} s, channel {number}: {} more lost", channel.unlisted));
             }
-            (channel.bits, channel.untold) = (0, 0);
+            (channel.bits, channel.unlisted) = (0, 0);
         }
     }
 

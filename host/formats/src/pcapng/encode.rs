@@ -30,7 +30,7 @@ pub(crate) struct Encoder {
     /// For somebody who reads meanwhile.
     statistics_every: Option<Duration>,
     /// When the statistics were last written.
-    told: Option<Instant>,
+    counted: Option<Instant>,
     /// Of the last record.
     latest_ns: Option<i64>,
 }
@@ -126,7 +126,7 @@ impl Encoder {
 
     /// What each channel had and lost until now. Wireshark adds up nothing: the last block of an interface counts.
     fn statistics(&mut self, time_ns: i64, out: &mut Vec<u8>) {
-        self.told = Some(Instant::now());
+        self.counted = Some(Instant::now());
         for (number, Interface { delivered, lost, .. }) in (0_u32..).zip(&self.interfaces) {
             block(out, STATISTICS, |out| {
                 let [high, low] = halves(time_ns);
@@ -270,7 +270,7 @@ impl Encode for Encoder {
         if !self.started {
             self.start(out);
         }
-        if self.told.is_none_or(|told| told.elapsed() >= every) {
+        if self.counted.is_none_or(|counted| counted.elapsed() >= every) {
             self.statistics(now_ns(), out);
         }
     }

@@ -35,7 +35,7 @@ const LAST_WORDS: Duration = Duration::from_secs(3);
 
 /// What is asked for.
 pub struct Wanted {
-    /// Or why there is none: that is told when Wireshark's pipe is open.
+    /// Or why there is none: it is reported when Wireshark's pipe is open.
     pub address: anyhow::Result<Address>,
     pub bit_rates: [BitRate; 2],
     pub mode: Mode,

@@ -137,9 +137,10 @@ impl LiveRecords {
     }
 
     fn report(&mut self, text: &str) {
-        match &mut self.reporter {
-            Some(reporter) => reporter(text),
-            None => eprintln!("cantap: {text}"),
+        if let Some(reporter) = &mut self.reporter {
+            reporter(text);
+        } else {
+            eprintln!("cantap: {text}");
         }
     }
 

@@ -1,6 +1,7 @@
 //! Bit rates of an interface's channels: given, saved on the board, or found by listening.
 
 use std::str::FromStr;
+use std::time::Duration;
 
 use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome};
@@ -52,6 +53,9 @@ impl FromStr for BitRate {
     }
 }
 
+/// How long to wait for a word on a silent channel while another one can be captured: Wireshark shows nothing meanwhile.
+const PATIENCE_BESIDE: Duration = Duration::from_secs(3);
+
 /// The channels to capture, by number, and the bit rates that have to be given for them. Reports what it does. A silent channel
 /// is left out if another one speaks.
 pub fn settle(
@@ -78,15 +82,17 @@ pub fn settle(
                 };
                 if device.defaults(channel)?.is_none() {
                     report(&format!("channel {number}: listening for its bit rate"));
-                    match autobaud::search(device, channel, &Limits::default(), &mut |_| {
-                        !interrupt::requested()
-                    })? {
+                    let mut limits = Limits::default();
+                    if !channels.is_empty() {
+                        limits.silence = PATIENCE_BESIDE;
+                    }
+                    match autobaud::search(device, channel, &limits, &mut |_| !interrupt::requested())? {
                         Outcome::Found { bitrate_bps, .. } => {
                             report(&format!("channel {number}: {bitrate_bps} bit/s found"));
                             rates.push(rate(bitrate_bps));
                         }
                         outcome => {
-                            let reason = failure(outcome, channel, Limits::default().silence.as_secs_f64());
+                            let reason = failure(outcome, channel, limits.silence.as_secs_f64());
                             report(&format!("{reason}; it is not captured"));
                             reasons.push(reason);
                             continue;

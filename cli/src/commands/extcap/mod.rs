@@ -44,8 +44,8 @@ pub struct Args {
     #[arg(long, help_heading = WIRESHARK)]
     extcap_interfaces: bool,
     /// Which Wireshark asks.
-    #[arg(long, value_name = "VERSION", num_args = 0..=1, help_heading = WIRESHARK)]
-    extcap_version: Option<Option<String>>,
+    #[arg(long, value_name = "VERSION", num_args = 0..=1, default_missing_value = "", help_heading = WIRESHARK)]
+    extcap_version: Option<String>,
     /// The interface that is meant.
     #[arg(long, value_name = "INTERFACE", help_heading = WIRESHARK)]
     extcap_interface: Option<String>,
@@ -133,7 +133,8 @@ pub fn run(args: Args) -> anyhow::Result<ExitCode> {
     if let Some(Action::Install(args)) = &args.command {
         return install::run(args);
     }
-    if args.extcap_interfaces {
+    // The version stands in front of the interfaces.
+    if args.extcap_interfaces || args.extcap_interface.is_none() && args.extcap_version.is_some() {
         return say(&sentences::interfaces(&places::all()));
     }
     let Some(interface) = &args.extcap_interface else {

@@ -21,10 +21,10 @@ pub fn all() -> Vec<Place> {
         eprintln!("cantap: {error}");
         Vec::new()
     });
-    of_boards(boards)
+    of_boards(&boards)
 }
 
-fn of_boards(boards: Vec<Board>) -> Vec<Place> {
+fn of_boards(boards: &[Board]) -> Vec<Place> {
     let serials: Vec<_> = boards.iter().map(|board| board.serial_number.clone()).collect();
     let name = |board: &Board| {
         let serial = board.serial_number.as_deref().filter(|serial| {
@@ -97,7 +97,7 @@ mod tests {
             product: None,
         };
         let names = |boards: &[Board]| {
-            of_boards(boards.to_vec()).iter().map(|place| place.name().to_owned()).collect::<Vec<_>>()
+            of_boards(boards).iter().map(|place| place.name().to_owned()).collect::<Vec<_>>()
         };
         assert_eq!(
             names(&[board("/dev/ttyACM0", Some("3A/1}")), board("COM7", None)]),

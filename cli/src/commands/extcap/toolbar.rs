@@ -157,12 +157,11 @@ impl Screen {
     pub fn show_channel(&self, channel: Channel, bitrate_bps: u32, mode: Mode) {
         let control = Control::of_channel(channel);
         let mut offered = OFFERED.iter().map(|(offered, _)| *offered);
-        match offered.find(|offered| args::bitrate(offered) == Ok(bitrate_bps)) {
-            Some(offered) => self.set(control, offered),
-            None => {
-                self.send(control.number(), ADD, &format!("{bitrate_bps}\0{bitrate_bps} bit/s"));
-                self.set(control, &bitrate_bps.to_string());
-            }
+        if let Some(offered) = offered.find(|offered| args::bitrate(offered) == Ok(bitrate_bps)) {
+            self.set(control, offered);
+        } else {
+            self.send(control.number(), ADD, &format!("{bitrate_bps}\0{bitrate_bps} bit/s"));
+            self.set(control, &bitrate_bps.to_string());
         }
         self.set(Control::Mode, mode_name(mode));
     }

@@ -131,7 +131,8 @@ impl WriteArgs {
         let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
         let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
         let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
-        Ok(WriteOptions { format: self.format.or(implied), rotation, table, zone: self.zone.clone() })
+        let format = self.format.or(implied);
+        Ok(WriteOptions { format, rotation, table, zone: self.zone.clone(), ..WriteOptions::default() })
     }
 }
 

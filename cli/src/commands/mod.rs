@@ -15,6 +15,7 @@ pub mod decode;
 pub mod defaults;
 pub mod demo;
 pub mod diff;
+pub mod extcap;
 pub mod r#gen;
 pub mod info;
 pub mod list;
@@ -83,6 +84,8 @@ pub enum Command {
     Bridge(bridge::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
+    /// Be interfaces of Wireshark: `cantap extcap install`.
+    Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
     /// Test a board: everything that it can show by itself, and a report to send in.
@@ -134,6 +137,7 @@ impl Command {
             Self::Autobaud(args) => autobaud::run(&args),
             #[cfg(target_os = "linux")]
             Self::Bridge(args) => bridge::run(&args),
+            Self::Extcap(args) => extcap::run(*args),
             Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),

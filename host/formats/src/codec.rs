@@ -70,6 +70,9 @@ pub(crate) trait Encode: Send {
         0
     }
 
+    /// Has the next record of a channel say something more, where a record can.
+    fn remark(&mut self, _channel: u8, _text: &str) {}
+
     /// Appends the file's end. A file without any record gets its head here.
     fn finish(&mut self, out: &mut Vec<u8>, left_out: &mut LeftOut);
 

@@ -39,7 +39,7 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
     let wheel = wheel(shell, "ci", &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
-    cmd!(shell, "{python} -m mypy --strict python/cantap").run()?;
+    cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap").run()?;
     cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
     let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");

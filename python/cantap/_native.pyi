@@ -23,6 +23,7 @@ __all__ = [
     "Table",
     "__version__",
     "decode",
+    "decode_table",
     "list_boards",
     "no_records",
     "search",
@@ -383,7 +384,10 @@ def stats(
     data_bitrates: list[tuple[int | None, int]],
     window_s: float,
 ) -> dict[str, Any]: ...
-def decode(options: Options) -> tuple[list[tuple[str, Table]], Table, Report]: ...
+def decode(options: Options) -> tuple[tuple[list[tuple[str, Table]], Table], Report]: ...
+def decode_table(
+    table: Any, db: Database, signals: list[str]
+) -> tuple[list[tuple[str, Table]], Table]: ...
 def search(
     options: Options, condition: str | None, ids: list[str], data: list[str], max_count: int | None
 ) -> Table: ...

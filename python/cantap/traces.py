@@ -103,12 +103,12 @@ class Messages(Mapping[str, Table]):
     A signal with texts has two: `Gear` and `Gear.text`. Where a frame does not have a signal, there is no value.
     """
 
-    def __init__(self, tables: dict[str, Table], events: Table, report: Report) -> None:
+    def __init__(self, tables: dict[str, Table], events: Table, report: Report | None) -> None:
         self._tables = tables
         self.events = events
         """What happened beside frames: losses, bus errors, states. A series with a hole is explained here."""
         self.report = report
-        """What was read, and what could not be."""
+        """What was read, and what could not be; `None` if no file was."""
 
     def __getitem__(self, message: str) -> Table:
         return self._tables[message]
@@ -120,11 +120,11 @@ class Messages(Mapping[str, Table]):
         return len(self._tables)
 
     def __repr__(self) -> str:
-        return f"<cantap.Messages of {self.report.file}: {', '.join(self._tables)}>"
+        return f"<cantap.Messages: {', '.join(self._tables)}>"
 
 
 def decode(
-    path: Path,
+    source: Any,
     db: Databases,
     *,
     signals: Words = (),
@@ -136,10 +136,19 @@ def decode(
     zone: str | None = None,
     strict: bool = False,
 ) -> Messages:
-    """Decodes a trace into a table for each message, with a column for each signal; what is asked for is as with `scan`."""
-    options = _options(path, db, signals, filter, channel, start, end, format, zone, strict)
-    tables, events, report = _native.decode(options)
-    return Messages(dict(tables), events, report)
+    """Decodes a trace into a table for each message, with a column for each signal.
+
+    `source` is a file, or a table of records, such as a device's batches: of this package, or of anything else that exports Arrow.
+    What of a file is asked for is as with `scan`; of a table it is `signals` alone.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        options = _options(source, db, signals, filter, channel, start, end, format, zone, strict)
+        (tables, events), report = _native.decode(options)
+        return Messages(dict(tables), events, report)
+    if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
+        raise ValueError("of a table only signals can be chosen; choose its rows before")
+    tables, events = _native.decode_table(_with_our_types(source), _database(db), _words(signals))
+    return Messages(dict(tables), events, None)
 
 
 def search(
@@ -257,7 +266,7 @@ def _options(
 ) -> Options:
     return {
         "path": path,
-        "db": db if db is None or isinstance(db, Database) else load_database(db),
+        "db": None if db is None else _database(db),
         "signals": _words(signals),
         "filters": _words(filter),
         "channels": _channels(channel),
@@ -267,6 +276,10 @@ def _options(
         "zone": zone,
         "strict": strict,
     }
+
+
+def _database(db: Databases) -> Database:
+    return db if isinstance(db, Database) else load_database(db)
 
 
 def _channels(channel: int | Iterable[int]) -> list[int]:

@@ -14,9 +14,10 @@ use cantap_columns::{FrameColumns, MessageColumns};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, MessageRef};
+use cantap_signals::{Decoder, MessageRef, SignalValue};
 use pyo3::prelude::*;
 
+use crate::database::Database;
 use crate::error::Error;
 use crate::report::{Report, by_kind, from_json};
 use crate::scan::warn;
@@ -84,37 +85,81 @@ pub fn stats<'py>(
     from_json(py, &summary.to_string())
 }
 
-/// A trace as a table for each message, and one of what happened beside frames.
-#[pyfunction]
-#[expect(clippy::type_complexity, reason = "for Python's half alone")]
-pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Vec<(String, Table)>, Table, Py<Report>)> {
-    let decoder =
-        options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
-    let chosen = !options.signals.is_empty();
-    let report = Report::default();
-    let mut tables: HashMap<MessageRef, MessageColumns> = HashMap::new();
-    let mut events = FrameColumns::default();
-    let mut values = Vec::new();
-    walk(py, &options, &report, |record, source| {
+/// Records that become a table for each message, and one of what happened beside frames.
+struct PerMessage {
+    decoder: Arc<Decoder>,
+    /// Chosen signals only: a message without any of them counts for nothing.
+    chosen: bool,
+    tables: HashMap<MessageRef, MessageColumns>,
+    events: FrameColumns,
+    values: Vec<SignalValue>,
+}
+
+/// What Python's half makes a mapping of: tables by name, and the events.
+type Tables = (Vec<(String, Table)>, Table);
+
+impl PerMessage {
+    fn new(decoder: Arc<Decoder>, chosen: bool) -> Self {
+        Self { decoder, chosen, tables: HashMap::new(), events: FrameColumns::default(), values: Vec::new() }
+    }
+
+    /// Appends a record; returns how many values it has, if it is a frame of a message.
+    fn push(&mut self, record: &cantap::TraceRecord) -> Option<usize> {
+        let Self { decoder, chosen, tables, events, values } = self;
         let Some(frame) = record.frame() else {
             events.push(record);
-            return Ok(());
+            return None;
         };
-        let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { return Ok(()) };
-        if values.is_empty() && chosen {
-            return Ok(());
+        let reference = decoder.decode(record.channel, frame, values)?;
+        if values.is_empty() && *chosen {
+            return None;
         }
-        source.counts.decoded += 1;
-        source.counts.values += values.len() as u64;
         let message = decoder.message(reference);
-        tables
-            .entry(reference)
-            .or_insert_with(|| MessageColumns::new(message))
-            .push(message, record, &values);
+        tables.entry(reference).or_insert_with(|| MessageColumns::new(message)).push(message, record, values);
+        Some(values.len())
+    }
+
+    fn finish(mut self) -> Tables {
+        (named(&self.decoder, self.tables), Table::of_batch(self.events.take()))
+    }
+}
+
+/// A trace as a table for each message, and one of what happened beside frames.
+#[pyfunction]
+pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
+    let decoder =
+        options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
+    let mut tables = PerMessage::new(decoder, !options.signals.is_empty());
+    let report = Report::default();
+    walk(py, &options, &report, |record, source| {
+        if let Some(values) = tables.push(record) {
+            source.counts.decoded += 1;
+            source.counts.values += values as u64;
+        }
         Ok(())
     })?;
-    let tables = named(&decoder, tables);
-    Ok((tables, Table::of_batch(events.take()), Py::new(py, report)?))
+    Ok((tables.finish(), Py::new(py, report)?))
+}
+
+/// The same of a table of records.
+#[pyfunction]
+pub fn decode_table(
+    py: Python<'_>,
+    table: &Bound<'_, PyAny>,
+    db: Py<Database>,
+    signals: Vec<String>,
+) -> PyResult<Tables> {
+    let mut tables = PerMessage::new(db.get().selecting(&signals)?, !signals.is_empty());
+    for batch in batches_of(table)? {
+        py.detach(|| -> Result<(), Error> {
+            for record in records_of(batch)? {
+                tables.push(&record);
+            }
+            Ok(())
+        })?;
+        py.check_signals()?;
+    }
+    Ok(tables.finish())
 }
 
 /// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
@@ -288,6 +333,7 @@ impl Drop for Temporary {
 /// Adds the functions to the module.
 pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_function(wrap_pyfunction!(decode, module)?)?;
+    module.add_function(wrap_pyfunction!(decode_table, module)?)?;
     module.add_function(wrap_pyfunction!(no_records, module)?)?;
     module.add_function(wrap_pyfunction!(search, module)?)?;
     module.add_function(wrap_pyfunction!(stats, module)?)?;

@@ -25,6 +25,18 @@ def test_decoding_gives_a_table_for_each_message(log, dbc):
         engine.column_metadata("Spead")
 
 
+def test_tables_of_records_are_decoded_too(log, dbc):
+    table = cantap.read(log)
+    for source in (table, table.to_polars(), cantap.scan(log)):
+        decoded = cantap.decode(source, dbc, signals="Speed")
+        assert [row["Speed"] for row in rows(decoded["Engine"])] == [8.5, 85.0]
+        assert len(decoded.events) == 1 and decoded.report is None
+    with pytest.raises(ValueError, match="signals"):
+        cantap.decode(table, dbc, channel=1)
+    with pytest.raises(TypeError):
+        cantap.decode(5, dbc)
+
+
 def test_what_is_looked_for_is_found_with_its_place(log, dbc):
     found = cantap.search(log, "Speed > 50", db=dbc)
     assert [row["place"] for row in rows(found)] == [4]

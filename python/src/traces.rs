@@ -1,6 +1,6 @@
 //! What is done with a whole trace.
 
-use std::collections::HashMap;
+use std::collections::{HashMap, HashSet};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use cantap_columns::{FrameColumns, MessageColumns};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, MessageRef, SignalValue};
+use cantap_signals::{Decoder, Message, MessageRef, Selection, SignalValue};
 use pyo3::prelude::*;
 
 use crate::database::Database;
@@ -88,8 +88,8 @@ pub fn stats<'py>(
 /// Records that become a table for each message, and one of what happened beside frames.
 struct PerMessage {
     decoder: Arc<Decoder>,
-    /// Chosen signals only: a message without any of them counts for nothing.
-    chosen: bool,
+    /// Of chosen signals only: a message without any of them counts for nothing.
+    chosen: Option<Selection>,
     tables: HashMap<MessageRef, MessageColumns>,
     events: FrameColumns,
     values: Vec<SignalValue>,
@@ -99,8 +99,10 @@ struct PerMessage {
 type Tables = (Vec<(String, Table)>, Table);
 
 impl PerMessage {
-    fn new(decoder: Arc<Decoder>, chosen: bool) -> Self {
-        Self { decoder, chosen, tables: HashMap::new(), events: FrameColumns::default(), values: Vec::new() }
+    fn new(decoder: Arc<Decoder>, signals: &[String]) -> Result<Self, Error> {
+        let chosen = if signals.is_empty() { None } else { Some(Selection::new(signals)?) };
+        let events = FrameColumns::default();
+        Ok(Self { decoder, chosen, tables: HashMap::new(), events, values: Vec::new() })
     }
 
     /// Appends a record; returns how many values it has, if it is a frame of a message.
@@ -111,7 +113,7 @@ impl PerMessage {
             return None;
         };
         let reference = decoder.decode(record.channel, frame, values)?;
-        if values.is_empty() && *chosen {
+        if values.is_empty() && chosen.is_some() {
             return None;
         }
         let message = decoder.message(reference);
@@ -120,7 +122,7 @@ impl PerMessage {
     }
 
     fn finish(mut self) -> Tables {
-        (named(&self.decoder, self.tables), Table::of_batch(self.events.take()))
+        (named(&self.decoder, self.tables, self.chosen.as_ref()), Table::of_batch(self.events.take()))
     }
 }
 
@@ -129,7 +131,7 @@ impl PerMessage {
 pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
     let decoder =
         options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
-    let mut tables = PerMessage::new(decoder, !options.signals.is_empty());
+    let mut tables = PerMessage::new(decoder, &options.signals)?;
     let report = Report::default();
     walk(py, &options, &report, |record, source| {
         if let Some(values) = tables.push(record) {
@@ -149,7 +151,7 @@ pub fn decode_table(
     db: Py<Database>,
     signals: Vec<String>,
 ) -> PyResult<Tables> {
-    let mut tables = PerMessage::new(db.get().selecting(&signals)?, !signals.is_empty());
+    let mut tables = PerMessage::new(db.get().selecting(&signals)?, &signals)?;
     for batch in batches_of(table)? {
         py.detach(|| -> Result<(), Error> {
             for record in records_of(batch)? {
@@ -163,7 +165,11 @@ pub fn decode_table(
 }
 
 /// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
-fn named(decoder: &Decoder, mut tables: HashMap<MessageRef, MessageColumns>) -> Vec<(String, Table)> {
+fn named(
+    decoder: &Decoder,
+    mut tables: HashMap<MessageRef, MessageColumns>,
+    chosen: Option<&Selection>,
+) -> Vec<(String, Table)> {
     let mut named: Vec<(String, Table)> = Vec::new();
     for (reference, channel, message) in decoder.messages() {
         let Some(mut table) = tables.remove(&reference) else { continue };
@@ -174,9 +180,27 @@ fn named(decoder: &Decoder, mut tables: HashMap<MessageRef, MessageColumns>) -> 
         if let Some(channel) = channel.filter(|_| named.iter().any(|(other, _)| *other == name)) {
             name = format!("{name}-{channel}");
         }
-        named.push((name, Table::of_batch(table.take())));
+        let batch = table.take();
+        let batch = chosen.map_or_else(|| batch.clone(), |chosen| only(&batch, message, chosen));
+        named.push((name, Table::of_batch(batch)));
     }
     named
+}
+
+/// The columns of time, channel and identifier, and those of the chosen signals.
+fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBatch {
+    let left_out: HashSet<_> = message
+        .signals
+        .iter()
+        .filter(|signal| !chosen.matches(message, signal))
+        .flat_map(|signal| [signal.label().into_owned(), format!("{}.text", signal.label())])
+        .collect();
+    let schema = batch.schema();
+    let kept: Vec<_> = (0..schema.fields().len())
+        .filter(|at| *at < 3 || !left_out.contains(schema.field(*at).name()))
+        .collect();
+    // Cannot fail: all of these are there.
+    batch.project(&kept).unwrap_or_else(|_| batch.clone())
 }
 
 /// The records that are looked for, each with its place in the trace.

@@ -29,6 +29,7 @@ def test_tables_of_records_are_decoded_too(log, dbc):
     table = cantap.read(log)
     for source in (table, table.to_polars(), cantap.scan(log)):
         decoded = cantap.decode(source, dbc, signals="Speed")
+        assert decoded["Engine"].column_names == ("time", "channel", "id", "Speed")
         assert [row["Speed"] for row in rows(decoded["Engine"])] == [8.5, 85.0]
         assert len(decoded.events) == 1 and decoded.report is None
     with pytest.raises(ValueError, match="signals"):

@@ -56,6 +56,15 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     Ok(Outcome::Passed)
 }
 
+/// Times it beside other people's packages.
+#[cfg(feature = "bench")]
+pub fn measure() -> Result<()> {
+    let shell = workspace::shell()?;
+    let wheel = wheel(&shell, &workspace::root(), "release", &target().join("dist"))?;
+    let python = environment(&shell, &wheel)?;
+    Ok(cmd!(shell, "{python} python/bench/side_by_side.py").run()?)
+}
+
 /// Where its crates are compiled: with features and profiles of their own.
 fn target() -> PathBuf {
     workspace::target().join("python")

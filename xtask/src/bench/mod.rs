@@ -57,6 +57,8 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// The package for Python, beside python-can, cantools and asammdf.
+    Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
 }
@@ -116,6 +118,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,
         }
     }

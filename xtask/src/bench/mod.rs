@@ -63,6 +63,8 @@ enum Subject {
     Stats,
     /// Redraws of the live view's graph with five million values in the window.
     Graph,
+    /// The package for Python, beside python-can, cantools and asammdf.
+    Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
     /// A shared board: eight clients on two saturated channels, two of them slow.
@@ -125,6 +127,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
             Subject::Graph => graph::run()?,
+            Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,
             #[cfg(unix)]
             Subject::Serve => serve::run(args.seconds)?,

@@ -47,6 +47,7 @@ mod rescue;
 mod sending;
 mod server;
 mod shells;
+mod speaking;
 mod stderr;
 mod timing_args;
 mod trace_output;

@@ -51,7 +51,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line, without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-const LINES: [(&str, i32, &[&str]); 42] = [
+const LINES: [(&str, i32, &[&str]); 54] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("status -d virtual --registers", 0, &["status"]),
@@ -89,6 +89,18 @@ const LINES: [(&str, i32, &[&str]); 42] = [
     ("search a.log --db car.dbc --id 100 -C 2", 0, &["search", "search_end"]),
     ("search a.log error%or%rtr", 0, &["search", "search_end"]),
     ("conversations talk.log", 0, &["conversations", "conversations_end"]),
+    ("obd supported -d virtual:car", 0, &["conversations", "conversations"]),
+    ("obd live -d virtual:car 0C -n 1", 0, &["conversations"]),
+    ("obd codes -d virtual:car", 0, &["conversations", "conversations"]),
+    ("obd vin -d virtual:car", 0, &["conversations", "conversations"]),
+    ("obd clear -d virtual:car --yes", 0, &["conversations", "conversations"]),
+    ("uds read -d virtual:car F190", 0, &["conversations"]),
+    ("uds session -d virtual:car extended", 0, &["conversations"]),
+    ("uds routine -d virtual:car start FF00", 1, &["conversations"]),
+    ("uds tester-present -d virtual:car", 0, &["conversations"]),
+    ("uds reset -d virtual:car soft", 0, &["conversations"]),
+    ("uds dtc -d virtual:car", 0, &["conversations"]),
+    ("uds raw -d virtual:car 22F190", 0, &["conversations"]),
     ("diff a.log b.log", 0, &["diff"]),
     ("diff b.log a.log --ignore-channels", 0, &["diff"]),
     ("plot a.log --db car.dbc -o out.svg", 0, &["plot"]),

@@ -18,6 +18,7 @@ pub mod info;
 pub mod list;
 pub mod man;
 pub mod monitor;
+pub mod obd;
 pub mod plot;
 pub mod replay;
 pub mod search;
@@ -27,6 +28,7 @@ pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod uds;
 pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
@@ -58,6 +60,10 @@ pub enum Command {
     Capture(capture::Args),
     /// Show what the frames mean: requests and responses, transfers, by protocol.
     Conversations(conversations::Args),
+    /// Ask a vehicle by OBD-II: what it supports, live values, trouble codes, its VIN.
+    Obd(Box<obd::Args>),
+    /// Ask an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
+    Uds(Box<uds::Args>),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -115,6 +121,8 @@ impl Command {
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
             Self::Conversations(args) => conversations::run(&args),
+            Self::Obd(args) => obd::run(&args),
+            Self::Uds(args) => uds::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

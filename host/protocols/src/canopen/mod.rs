@@ -15,6 +15,9 @@ mod signs;
 mod tests;
 mod types;
 
+pub use names::{abort as abort_text, state as state_name};
+pub(crate) use sdo::crc_of;
+
 use std::borrow::Cow;
 use std::sync::Arc;
 

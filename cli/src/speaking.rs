@@ -9,8 +9,8 @@ use std::time::{Duration, Instant};
 use anyhow::{anyhow, bail};
 use cantap::device::Records;
 use cantap::transmit::Stream;
-use cantap::wire::message::Mode;
-use cantap::{Channel, Frame, TraceEvent, TraceRecord};
+use cantap::wire::message::{Mode, Periodic};
+use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
 
@@ -22,10 +22,13 @@ use crate::commands::conversations;
 use crate::completion;
 use crate::sending::Sending;
 use crate::words::{counted, state_name};
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// The longest time between two looks at what is being sent, and at Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// The device's slot for frames that are repeated.
+const REPEAT_SLOT: u8 = 0;
 
 /// Where to talk; for commands to flatten into theirs.
 #[derive(clap::Args)]
@@ -47,9 +50,23 @@ pub struct SpeakArgs {
 impl SpeakArgs {
     /// Begins a session with the device, and opens the channel: it acknowledges from now on, and sends what it is told to.
     pub fn open(&self) -> anyhow::Result<OpenDevice> {
+        self.open_in(Mode::Normal)
+    }
+
+    /// The channel.
+    pub const fn channel(&self) -> Channel {
+        self.channel
+    }
+
+    /// As [`Self::open`], but the channel only listens.
+    pub fn listen(&self) -> anyhow::Result<OpenDevice> {
+        self.open_in(Mode::ListenOnly)
+    }
+
+    fn open_in(&self, mode: Mode) -> anyhow::Result<OpenDevice> {
         interrupt::watch()?;
         let device = self.device.clone().map_or_else(the_one_connected, Ok)?.open()?;
-        self.channel_args().open(&device, [self.channel].into_iter(), Mode::Normal, None)?;
+        self.channel_args().open(&device, [self.channel].into_iter(), mode, None)?;
         Ok(device)
     }
 
@@ -126,6 +143,11 @@ impl Speaking<'_> {
         std::mem::take(&mut self.events)
     }
 
+    /// Takes back what [`Self::take_events`] gave.
+    pub fn put_back(&mut self, events: Vec<Event>) {
+        self.events = events;
+    }
+
     /// Prints what the reader of the bus has said since the last call, as far as it is wanted.
     pub fn tell(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> anyhow::Result<()> {
         let mut out = std::io::stdout().lock();
@@ -157,6 +179,42 @@ impl Speaking<'_> {
             });
             self.take_records(wait, Some(machine))?;
             self.look()?;
+        }
+    }
+
+    /// Has the device send frames again and again by its own clock, until as many as wanted, the end of the time, or Ctrl-C. Returns
+    /// how many were sent.
+    pub fn repeat(
+        &mut self,
+        frame: Frame,
+        period: Duration,
+        count: Option<u32>,
+        time: Option<Duration>,
+    ) -> anyhow::Result<u64> {
+        let period_ticks = periodic::period_ticks(period, self.device.hello().tick_hz)
+            .map_err(|error| wrong(error.to_string()))?;
+        let entry =
+            Periodic { frame, period_ticks, count: count.unwrap_or(0), modifiers: heapless::Vec::new() };
+        let started = Instant::now();
+        let before = self.sending.sent();
+        self.device.set_periodic(self.channel, REPEAT_SLOT, Some(entry))?;
+        loop {
+            self.take_records(LOOK_EVERY, None)?;
+            self.stream.wait(Duration::ZERO)?;
+            let ends = self.stream.take_ended();
+            let goes_on = self.sending.device_goes_on(&ends);
+            let sent = self.sending.sent() - before;
+            let is_over = interrupt::requested()
+                || time.is_some_and(|time| started.elapsed() >= time)
+                || count.is_some_and(|count| sent >= u64::from(count));
+            if is_over {
+                self.device.set_periodic(self.channel, REPEAT_SLOT, None)?;
+                return Ok(sent);
+            }
+            if !goes_on {
+                self.pushed = self.sending.ended() + 1;
+                return Err(self.stopped());
+            }
         }
     }
 

@@ -14,7 +14,7 @@ use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::Interface;
 
-use self::sheet::SheetPath;
+pub use self::sheet::SheetPath;
 use self::summary::Summary;
 use self::surveyed::Surveyed;
 use super::decode::Seconds;

@@ -3,6 +3,7 @@
 pub mod align;
 pub mod autobaud;
 pub mod bits;
+pub mod canopen;
 pub mod capture;
 pub mod care;
 pub mod completions;
@@ -15,6 +16,7 @@ pub mod demo;
 pub mod diff;
 pub mod r#gen;
 pub mod info;
+pub mod j1939;
 pub mod list;
 pub mod man;
 pub mod monitor;
@@ -64,6 +66,10 @@ pub enum Command {
     Obd(Box<obd::Args>),
     /// Ask an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
     Uds(Box<uds::Args>),
+    /// Talk with CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
+    Canopen(Box<canopen::Args>),
+    /// Talk with J1939 nodes: claim an address, ask for parameter groups and trouble codes, send messages.
+    J1939(Box<j1939::Args>),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -123,6 +129,8 @@ impl Command {
             Self::Conversations(args) => conversations::run(&args),
             Self::Obd(args) => obd::run(&args),
             Self::Uds(args) => uds::run(&args),
+            Self::Canopen(args) => canopen::run(&args),
+            Self::J1939(args) => j1939::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

@@ -120,9 +120,10 @@ enum ResetKind {
 
 /// Bytes as they are given in hexadecimal.
 #[derive(Clone, Debug, PartialEq, Eq)]
-struct Hex(Vec<u8>);
+pub struct Hex(pub Vec<u8>);
 
-fn bytes(text: &str) -> Result<Hex, String> {
+/// See [`Hex`].
+pub fn bytes(text: &str) -> Result<Hex, String> {
     let digits: String = text.chars().filter(|letter| !letter.is_whitespace() && *letter != '.').collect();
     let pairs =
         || (0..digits.len()).step_by(2).map(|at| u8::from_str_radix(digits.get(at..at + 2)?, 16).ok());

@@ -1,5 +1,6 @@
 //! Security access: the ECU's seed goes to the user's command, whose key goes to the ECU.
 
+use std::fmt::Write as _;
 use std::io::Write as _;
 use std::process::{Command, Stdio};
 
@@ -31,7 +32,7 @@ impl KeyArgs {
         let answer = first(client.ask(&[0x27, level])?)?;
         client.all_agreed()?;
         let seed = answer.data.get(2..).unwrap_or_default();
-        // An ECU that is unlocked says so by a seed of zeros (ISO 14229-1, 10.4.1).
+        // An ECU that is unlocked says so by a seed of zeros (ISO 14229-1).
         if seed.iter().all(|byte| *byte == 0) {
             return Ok(());
         }
@@ -42,7 +43,10 @@ impl KeyArgs {
 }
 
 fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
-    let seed: String = seed.iter().map(|byte| format!("{byte:02X}")).collect();
+    let seed = seed.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02X}");
+        text
+    });
     let line = command.replace("{seed}", &seed);
     let mut shell = if cfg!(windows) { Command::new("cmd") } else { Command::new("sh") };
     shell.args([if cfg!(windows) { "/C" } else { "-c" }, &line]).stdin(Stdio::piped()).stdout(Stdio::piped());

@@ -103,6 +103,9 @@ impl ServerAnswer {
     }
 }
 
+/// Answers, and whose answers broke off.
+pub type Answers = (Vec<ServerAnswer>, Vec<(Endpoint, TransferError)>);
+
 /// Why there is no answer.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[non_exhaustive]
@@ -221,7 +224,7 @@ impl Exchange {
     }
 
     /// The answers, and those that broke off, if there is one that did not. To be called when it is done.
-    pub fn finish(self) -> Result<(Vec<ServerAnswer>, Vec<(Endpoint, TransferError)>), ExchangeError> {
+    pub fn finish(self) -> Result<Answers, ExchangeError> {
         match self.end {
             Some(Err(error)) => Err(error),
             _ => Ok((self.answers, self.broken)),

@@ -1,5 +1,5 @@
 use super::*;
-use crate::active::testing::{Fate, arrives, disturbed, run};
+use crate::active::testing::{Say, arrives, disturbed, run};
 
 fn endpoint(text: &str) -> Endpoint {
     format!("{text}:7FF").parse::<crate::iso_tp::Pair>().map(|pair| pair.a).unwrap()
@@ -53,14 +53,14 @@ impl Server {
         Frame::data_frame(Id::standard_truncated(0x7E8), bytes).unwrap()
     }
 
-    fn flow(&self, say: &mut Vec<(u64, Frame)>) {
+    fn flow(&self, say: &mut Say) {
         for wait in 0..self.waits {
             say.push((u64::from(wait) * 500 * MS, Self::frame(&[0x31, 0, 0])));
         }
         say.push((u64::from(self.waits) * 500 * MS, Self::frame(&[0x30, self.block_size, self.separation])));
     }
 
-    fn whole(&mut self, request: Vec<u8>, say: &mut Vec<(u64, Frame)>) {
+    fn whole(&mut self, request: Vec<u8>, say: &mut Say) {
         self.requests.push(request);
         for (after, answer) in (1..).zip(self.answers.clone()) {
             if answer.len() <= 7 {
@@ -75,7 +75,7 @@ impl Server {
 }
 
 impl super::super::testing::Peer for Server {
-    fn hear(&mut self, id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>) {
+    fn hear(&mut self, id: Id, data: &[u8], say: &mut Say) {
         assert_eq!(id.raw(), 0x7E0);
         match data[0] >> 4 {
             0 => self.whole(data[1..=usize::from(data[0])].to_vec(), say),
@@ -146,7 +146,7 @@ fn requests_and_answers_of_any_length_arrive_whole() {
                 ..TransferSettings::default()
             };
             assert_eq!(answers(with(&request, settings), &mut server), Ok(vec![answer.clone()]), "{length}");
-            assert_eq!(server.requests, [request.clone()]);
+            assert_eq!(server.requests, std::slice::from_ref(&request));
         }
     }
 }
@@ -212,7 +212,7 @@ fn all_who_answer_a_request_to_all_are_heard() {
     );
     let frame = |id: u32, bytes: &[u8]| Frame::data_frame(Id::standard_truncated(id), bytes).unwrap();
     let mut flows = Vec::new();
-    let mut peer = |id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| {
+    let mut peer = |id: Id, data: &[u8], say: &mut Say| {
         if id.raw() == 0x7DF {
             say.push((5 * MS, frame(0x7E9, &[3, 0x49, 2, 1])));
             say.push((6 * MS, frame(0x7E8, &[0x10, 10, 0x49, 2, 1, b'V', b'I', b'N'])));
@@ -239,9 +239,9 @@ fn all_who_answer_a_request_to_all_are_heard() {
 #[test]
 fn whatever_the_server_does_there_is_an_end() {
     let frame = |bytes: &[u8]| Frame::data_frame(Id::standard_truncated(0x7E8), bytes).unwrap();
-    let fails = |request: &[u8], lie: &dyn Fn(&[u8], &mut Vec<(u64, Frame)>)| {
+    let fails = |request: &[u8], lie: &dyn Fn(&[u8], &mut Say)| {
         let mut exchange = physical(request);
-        let mut peer = |_: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| lie(data, say);
+        let mut peer = |_: Id, data: &[u8], say: &mut Say| lie(data, say);
         let (took_ns, _) = run(&mut exchange, &mut peer, arrives);
         (took_ns / 1_000_000_000, exchange.finish().unwrap_err())
     };
@@ -344,5 +344,4 @@ fn no_disturbance_makes_a_wrong_answer() {
         }
     }
     assert!(whole > 50 && failed > 50, "{whole} {failed}");
-    let _ = Fate::Lost;
 }

@@ -89,7 +89,7 @@ enum Asking {
     Settles { until_ns: u64 },
 }
 
-/// Finds one node that has no number, by halving (CiA 305, 3.9.6).
+/// Finds one node that has no number, by halving (CiA 305).
 #[derive(Debug)]
 pub struct FastScan {
     timeout_ns: u64,
@@ -211,7 +211,7 @@ pub enum LssOrder {
     Store,
 }
 
-/// The index of a bit rate in CiA's table (CiA 305, table 1).
+/// The index of a bit rate in CiA's table (CiA 305).
 pub const fn bit_rate_index(bitrate_bps: u32) -> Option<u8> {
     Some(match bitrate_bps {
         1_000_000 => 0,
@@ -314,12 +314,12 @@ impl Machine for LssMaster {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::active::testing::{Fate, arrives, disturbed, run};
+    use crate::active::testing::{Fate, Say, arrives, disturbed, run};
 
     const MS: u64 = 1_000_000;
 
     /// Slaves by CiA 305: each is where it has come to, or out of the scan.
-    fn slaves(addresses: &[[u32; 4]]) -> impl FnMut(Id, &[u8], &mut Vec<(u64, Frame)>) {
+    fn slaves(addresses: &[[u32; 4]]) -> impl FnMut(Id, &[u8], &mut Say) {
         let mut slaves: Vec<([u32; 4], u8)> = addresses.iter().map(|address| (*address, 0)).collect();
         move |id, data, say| {
             assert_eq!(id, REQUEST);
@@ -392,7 +392,7 @@ mod tests {
         let order = |order: LssOrder, answer: Option<[u8; 8]>| {
             let mut master = LssMaster::new(order, 100 * MS);
             let mut sent_last = 0;
-            let mut peer = |_: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| {
+            let mut peer = |_: Id, data: &[u8], say: &mut Say| {
                 sent_last = data[0];
                 if let Some(answer) = answer.filter(|_| matches!(data[0], 0x11 | 0x13 | 0x17 | 0x43)) {
                     say.push((MS, Frame::from_bus(RESPONSE, false, 8, answer)));

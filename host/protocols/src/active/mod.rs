@@ -13,6 +13,8 @@ pub mod station;
 mod testing;
 pub mod transfer;
 
+use std::collections::VecDeque;
+
 use cantap_trace::Id;
 use cantap_wire::Frame;
 
@@ -37,6 +39,44 @@ pub trait Machine {
 
     /// Whether it has ended, well or not.
     fn is_done(&self) -> bool;
+}
+
+/// Frames that nobody has to answer: done when they were on the bus.
+#[derive(Clone, Debug)]
+pub struct Announcement {
+    frames: VecDeque<Frame>,
+    under_way: usize,
+}
+
+impl Announcement {
+    /// These frames, in this order.
+    pub fn new(frames: impl IntoIterator<Item = Frame>) -> Self {
+        Self { frames: frames.into_iter().collect(), under_way: 0 }
+    }
+}
+
+impl Machine for Announcement {
+    fn next(&mut self, _now_ns: u64) -> Option<Frame> {
+        let frame = self.frames.pop_front();
+        self.under_way += usize::from(frame.is_some());
+        frame
+    }
+
+    fn sent(&mut self, _now_ns: u64) {
+        self.under_way = self.under_way.saturating_sub(1);
+    }
+
+    fn hear(&mut self, _now_ns: u64, _id: Id, _data: &[u8]) {}
+
+    fn gap(&mut self, _now_ns: u64) {}
+
+    fn due_ns(&self) -> Option<u64> {
+        None
+    }
+
+    fn is_done(&self) -> bool {
+        self.frames.is_empty() && self.under_way == 0
+    }
 }
 
 /// The earliest of two deadlines.

@@ -77,18 +77,12 @@ impl Machine for NodeScan {
             let [low, high, sub] = DEVICE_TYPE;
             Some(Frame::from_bus(SdoIds::of(node).request, false, 8, [0x40, low, high, sub, 0, 0, 0, 0]))
         });
-        match frame {
-            Some(frame) => {
-                self.under_way += 1;
-                Some(frame)
-            }
-            None => {
-                if self.under_way == 0 && self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
-                    self.until_ns = None;
-                }
-                None
-            }
+        if frame.is_some() {
+            self.under_way += 1;
+        } else if self.under_way == 0 && self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
+            self.until_ns = None;
         }
+        frame
     }
 
     fn sent(&mut self, now_ns: u64) {
@@ -140,13 +134,13 @@ impl Machine for NodeScan {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::active::testing::{arrives, run};
+    use crate::active::testing::{Say, arrives, run};
 
     #[test]
     fn nodes_are_found_by_answers_and_by_heartbeats() {
         let frame = |id: u32, bytes: &[u8]| Frame::data_frame(Id::standard_truncated(id), bytes).unwrap();
         let mut aborted = false;
-        let mut peer = |id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| match (id.raw(), data[0]) {
+        let mut peer = |id: Id, data: &[u8], say: &mut Say| match (id.raw(), data[0]) {
             (0x605, _) => say.push((1000, frame(0x585, &[0x43, 0, 0x10, 0, 0x92, 1, 2, 0]))),
             (0x607, _) => say.push((1000, frame(0x587, &[0x80, 0, 0x10, 0, 0, 0, 2, 6]))),
             (0x608, 0x40) => say.push((1000, frame(0x588, &[0x41, 0, 0x10, 0, 9, 0, 0, 0]))),

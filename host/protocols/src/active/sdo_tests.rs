@@ -1,5 +1,5 @@
 use super::*;
-use crate::active::testing::{Peer, arrives, disturbed, run};
+use crate::active::testing::{Peer, Say, arrives, disturbed, run};
 
 const MS: u64 = 1_000_000;
 
@@ -34,7 +34,7 @@ impl Server {
         }
     }
 
-    fn block(&mut self, say: &mut Vec<(u64, Frame)>) {
+    fn block(&mut self, say: &mut Say) {
         let mut at = self.block_at;
         for number in 1..=127 {
             let end = self.sending.len().min(at + 7);
@@ -55,7 +55,7 @@ fn answer(bytes: [u8; 8]) -> Frame {
 }
 
 impl Peer for Server {
-    fn hear(&mut self, id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>) {
+    fn hear(&mut self, id: Id, data: &[u8], say: &mut Say) {
         assert_eq!(id.raw(), 0x605);
         let data: [u8; 8] = data.try_into().unwrap();
         let size = (self.object.len() as u32).to_le_bytes();
@@ -87,7 +87,7 @@ impl Peer for Server {
             return;
         }
         match data[0] {
-            0x80 => {}
+            0x80 | 0xA1 => {}
             0x40 if (1..=4).contains(&self.object.len()) => {
                 let mut rest = [0; 4];
                 rest[..self.object.len()].copy_from_slice(&self.object);
@@ -123,7 +123,6 @@ impl Peer for Server {
                     self.block(say);
                 }
             }
-            0xA1 => {}
             0x23 | 0x27 | 0x2B | 0x2F => {
                 self.object = data[4..8 - usize::from(data[0] >> 2 & 3)].to_vec();
                 reply(with(0x60, [0; 4]));
@@ -210,19 +209,19 @@ fn a_node_that_refuses_is_understood_by_name() {
 /// A node that lies has an error for it, in bounded time, and is told.
 #[test]
 fn whatever_the_node_does_there_is_an_end() {
-    let fails = |by_blocks: bool, job: SdoJob, lie: &dyn Fn(&[u8], &mut Vec<(u64, Frame)>)| {
+    let fails = |by_blocks: bool, job: SdoJob, lie: &dyn Fn(&[u8], &mut Say)| {
         let mut client = client(job, by_blocks);
-        let mut peer = |_: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| lie(data, say);
+        let mut peer = |_: Id, data: &[u8], say: &mut Say| lie(data, say);
         let (took_ns, sent) = run(&mut client, &mut peer, arrives);
         assert!(took_ns < 60_000 * MS, "{took_ns}");
         (client.finish().unwrap_err(), sent.last().unwrap().data()[0])
     };
-    let begin = |say: &mut Vec<(u64, Frame)>, frame: [u8; 8]| say.push((MS, answer(frame)));
+    let begin = |say: &mut Say, frame: [u8; 8]| say.push((MS, answer(frame)));
     let (error, last) = fails(false, SdoJob::Read, &|_, _| {});
     assert_eq!((error, last), (SdoError::NoAnswer { after_ms: 500, done: 0 }, 0x80));
     // The same toggle for ever; empty segments for ever; more than was announced; a command out of place.
     let segments = |frame: [u8; 8]| {
-        move |data: &[u8], say: &mut Vec<(u64, Frame)>| match data[0] {
+        move |data: &[u8], say: &mut Say| match data[0] {
             0x40 => begin(say, [0x41, 0, 0x20, 1, 20, 0, 0, 0]),
             0x80 => {}
             _ => begin(say, frame),

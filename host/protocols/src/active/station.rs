@@ -14,7 +14,7 @@ use super::{Machine, earlier};
 use crate::j1939::Header;
 
 const MS: u64 = 1_000_000;
-/// Nobody may object to a claim any more after this time (J1939-81, 4.4.2).
+/// Nobody may object to a claim any more after this time (J1939-81).
 const CLAIM_NS: u64 = 250 * MS;
 /// So long an answer is waited for: Tr is 200 ms, and T3 1250 ms.
 const ANSWER_NS: u64 = 1250 * MS;
@@ -25,9 +25,9 @@ const ACKNOWLEDGE: u32 = 0xE800;
 const CLAIM: u32 = 0xEE00;
 const CONTROL: u32 = 0xEC00;
 const DATA: u32 = 0xEB00;
-/// The longest message (J1939-21, 5.10.1).
+/// The longest message (J1939-21).
 const MOST_BYTES: usize = 1785;
-/// Addresses that anybody may take (J1939-81, 4.2).
+/// Addresses that anybody may take (J1939-81).
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
 /// The NAME's bit that says so.
 const TAKES_ANY: u64 = 1 << 63;
@@ -252,7 +252,7 @@ impl Station {
         if by != self.address || matches!(self.phase, Phase::New | Phase::Done | Phase::Closing) {
             return;
         }
-        // The lower NAME goes first (J1939-81, 4.4.3.3).
+        // The lower NAME goes first (J1939-81).
         if self.name < name {
             return self.claim();
         }

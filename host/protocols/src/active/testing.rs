@@ -7,6 +7,9 @@ use cantap_wire::Frame;
 
 use super::Machine;
 
+/// Frames that are said, each with how long after, in nanoseconds.
+pub type Say = Vec<(u64, Frame)>;
+
 /// A frame takes this long.
 pub const FRAME_NS: u64 = 250_000;
 /// No machine may take longer, whatever happens on the bus.
@@ -15,11 +18,11 @@ const LONGEST_NS: u64 = 600_000_000_000;
 /// The other side of the bus: takes frames, says frames.
 pub trait Peer {
     /// A frame of the machine's; what is said is appended, each with how long after.
-    fn hear(&mut self, id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>);
+    fn hear(&mut self, id: Id, data: &[u8], say: &mut Say);
 }
 
-impl<F: FnMut(Id, &[u8], &mut Vec<(u64, Frame)>)> Peer for F {
-    fn hear(&mut self, id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>) {
+impl<F: FnMut(Id, &[u8], &mut Say)> Peer for F {
+    fn hear(&mut self, id: Id, data: &[u8], say: &mut Say) {
         self(id, data, say);
     }
 }
@@ -71,17 +74,16 @@ pub fn run(
                 now_ns = now_ns.max(at_ns) + FRAME_NS;
                 let mut arrive = |frame: Frame| machine.hear(now_ns, frame.id(), frame.data());
                 match fate() {
-                    Fate::Arrives => arrive(frame),
+                    Fate::Late if held.is_none() => {
+                        held = Some(frame);
+                        continue;
+                    }
+                    Fate::Arrives | Fate::Late => arrive(frame),
                     Fate::Lost => {}
                     Fate::Doubled => {
                         arrive(frame);
                         arrive(frame);
                     }
-                    Fate::Late if held.is_none() => {
-                        held = Some(frame);
-                        continue;
-                    }
-                    Fate::Late => arrive(frame),
                 }
                 if let Some(frame) = held.take() {
                     arrive(frame);

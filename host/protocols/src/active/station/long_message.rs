@@ -304,7 +304,7 @@ impl Outgoing {
                 }
                 self.state = State::Awaits { timeout_ns: HOLD_NS, until_ns: Some(now_ns + HOLD_NS) };
             }
-            // Clear to send while frames are under way is not to be (J1939-21, 5.10.3.4); they are confirmed soon.
+            // Clear to send while frames are under way is not to be (J1939-21); they are confirmed soon.
             17 => {
                 let (count, next) = (data[1], data[2]);
                 let is_again = next <= self.reached;

@@ -1,5 +1,5 @@
 use super::*;
-use crate::active::testing::{arrives, disturbed, run};
+use crate::active::testing::{Say, arrives, disturbed, run};
 
 const NAME: u64 = 0x8000_0000_0000_0005;
 
@@ -12,7 +12,7 @@ fn of(source: u8, pgn: u32, to: u8, data: &[u8]) -> Frame {
     frame(6, pgn, source, to, data)
 }
 
-fn nobody() -> impl FnMut(Id, &[u8], &mut Vec<(u64, Frame)>) {
+fn nobody() -> impl FnMut(Id, &[u8], &mut Say) {
     |_, _, _| {}
 }
 
@@ -29,7 +29,7 @@ fn an_address_is_claimed_for_a_quarter_of_a_second() {
 #[test]
 fn an_address_that_is_taken_is_given_up() {
     let claims = |own: u64, other: u64| {
-        let peer = move |id: Id, _: &[u8], say: &mut Vec<(u64, Frame)>| {
+        let peer = move |id: Id, _: &[u8], say: &mut Say| {
             if Header::of(id).unwrap().source == 0x80 {
                 say.push((MS, of(0x80, CLAIM, GLOBAL, &other.to_le_bytes())));
                 say.push((2 * MS, of(0x81, CLAIM, GLOBAL, &other.to_le_bytes())));
@@ -38,7 +38,7 @@ fn an_address_that_is_taken_is_given_up() {
         let mut once = 0;
         let mut station = Station::new(own, 0x80, StationJob::Claim);
         // A peer that objects again and again would be one that has not understood.
-        let mut peer = |id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| {
+        let mut peer = |id: Id, data: &[u8], say: &mut Say| {
             once += 1;
             if once == 1 {
                 peer(id, data, say);
@@ -54,12 +54,9 @@ fn an_address_that_is_taken_is_given_up() {
     assert_eq!((address, ended), (NULL, Err(StationError::AddressTaken { address: 0x80, name: 1 })));
 }
 
-fn request(
-    to: u8,
-    mut answer: impl FnMut(&mut Vec<(u64, Frame)>),
-) -> (Result<Vec<GroupAnswer>, StationError>, Vec<Frame>) {
+fn request(to: u8, mut answer: impl FnMut(&mut Say)) -> (Result<Vec<GroupAnswer>, StationError>, Vec<Frame>) {
     let mut station = Station::with_address(NAME, 0x80, StationJob::Request { pgn: 0xFECA, to });
-    let mut peer = |id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| {
+    let mut peer = |id: Id, data: &[u8], say: &mut Say| {
         if Header::of(id).unwrap().pgn == REQUEST {
             assert_eq!(data, [0xCA, 0xFE, 0]);
             answer(say);
@@ -88,7 +85,7 @@ fn a_group_is_asked_for_and_answered_in_every_way() {
     let (answers, _) = request(3, |_| {});
     assert_eq!(answers, Err(StationError::NoAnswer { after_ms: 1250 }));
     let (answers, _) = request(3, |say| {
-        say.push((MS, of(3, ACKNOWLEDGE, GLOBAL, &[1, 255, 255, 255, 0x80, 0xCA, 0xFE, 0])))
+        say.push((MS, of(3, ACKNOWLEDGE, GLOBAL, &[1, 255, 255, 255, 0x80, 0xCA, 0xFE, 0])));
     });
     assert_eq!(answers, Err(StationError::NotAcknowledged { from: 3, control: 1 }));
     // In many frames to all.
@@ -122,18 +119,16 @@ fn long_messages_arrive_whole_or_not_at_all() {
         let mut station = Station::with_address(NAME, 0x80, job);
         let mut incoming: Option<Incoming> = None;
         let mut got = None;
-        let mut peer = |id: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| {
+        let mut peer = |id: Id, data: &[u8], say: &mut Say| {
             let header = Header::of(id).unwrap();
             let data: [u8; 8] = data.try_into().unwrap();
             match (header.pgn, data[0]) {
                 (CONTROL, 16) => incoming = Incoming::connection(0, header, data),
                 (CONTROL, 255) => incoming = None,
-                (DATA, _) => {
-                    if incoming.as_mut().is_some_and(|incoming| incoming.take(0, data)) {
-                        let done = incoming.take().unwrap();
-                        say.extend(done.last_word(3).map(|word| (MS, word)));
-                        got = Some(done.into_data());
-                    }
+                (DATA, _) if incoming.as_mut().is_some_and(|incoming| incoming.take(0, data)) => {
+                    let done = incoming.take().unwrap();
+                    say.extend(done.last_word(3).map(|word| (MS, word)));
+                    got = Some(done.into_data());
                 }
                 _ => {}
             }
@@ -181,10 +176,10 @@ fn a_message_to_all_keeps_its_distances() {
 /// A receiver that lies has an error for it, in bounded time.
 #[test]
 fn whatever_the_receiver_does_there_is_an_end() {
-    let send = |lie: &dyn Fn(u8, &mut Vec<(u64, Frame)>)| {
+    let send = |lie: &dyn Fn(u8, &mut Say)| {
         let job = StationJob::Send { pgn: 0xD000, to: 3, priority: 6, data: bytes(100) };
         let mut station = Station::with_address(NAME, 0x80, job);
-        let mut peer = |_: Id, data: &[u8], say: &mut Vec<(u64, Frame)>| lie(data[0], say);
+        let mut peer = |_: Id, data: &[u8], say: &mut Say| lie(data[0], say);
         let (took_ns, _) = run(&mut station, &mut peer, arrives);
         assert!(took_ns < 100_000 * MS);
         station.finish().unwrap_err()
@@ -194,20 +189,20 @@ fn whatever_the_receiver_does_there_is_an_end() {
     assert_eq!(send(&|_, _| {}), StationError::Silent { from: 3, after_ms: 1250, done: 0, total: 15 });
     assert_eq!(
         send(&|first, say| if first == 16 {
-            say.push((MS, control([255, 2, 255])))
+            say.push((MS, control([255, 2, 255])));
         }),
         StationError::Aborted { from: 3, reason: 2 }
     );
     // Waits for ever, asks for the same for ever, asks for what there is not.
-    let holds = |first: u8, say: &mut Vec<(u64, Frame)>| {
+    let holds = |first: u8, say: &mut Say| {
         if first == 16 {
             say.extend((0..200).map(|at| (at * 500 * MS, control([17, 0, 255]))));
         }
     };
     assert!(matches!(send(&holds), StationError::Endless { .. }));
-    let same = |_: u8, say: &mut Vec<(u64, Frame)>| say.push((MS, control([17, 1, 1])));
+    let same = |_: u8, say: &mut Say| say.push((MS, control([17, 1, 1])));
     assert!(matches!(send(&same), StationError::Endless { .. }));
-    let beyond = |_: u8, say: &mut Vec<(u64, Frame)>| say.push((MS, control([17, 1, 99])));
+    let beyond = |_: u8, say: &mut Say| say.push((MS, control([17, 1, 99])));
     assert!(matches!(send(&beyond), StationError::Endless { .. }));
 }
 

@@ -155,7 +155,7 @@ impl Machine for FastScan {
     fn next(&mut self, now_ns: u64) -> Option<Frame> {
         match self.asking {
             Asking::Waits { until_ns } | Asking::Settles { until_ns } if now_ns >= until_ns => {
-                self.conclude()
+                self.conclude();
             }
             _ => {}
         }

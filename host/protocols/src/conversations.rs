@@ -49,7 +49,7 @@ impl Conversations {
             spoken[usize::from(evidence.channel)] |= evidence.protocol.bit();
         }
         let anywhere = spoken.iter().fold(0, |all, protocols| all | protocols);
-        // Without a survey and a choice, what is not told apart by its frames would be read twice.
+        // Without a survey and a choice, frames that two protocols could claim would be read twice.
         let chosen = options.spoken.is_some() || !options.protocols.is_empty();
         let speaks = |protocol: Protocol| chosen && wanted & anywhere & protocol.bit() != 0;
         let mut assemblers: Vec<(u16, Box<dyn Assembler + Send>)> = Vec::new();

@@ -76,6 +76,14 @@ fn an_ecu_is_asked_and_refuses_by_name() {
     assert!(code == Some(0) && said.contains("7DF > 7E9"), "{said}");
 }
 
+/// Its engine tells its trouble codes every second, asked or not.
+#[test]
+fn a_node_of_j1939_is_heard_for_a_bounded_time() {
+    let started = std::time::Instant::now();
+    assert!(well("j1939 -d virtual:car dm1").contains("SPN 110 FMI 17"));
+    assert!(started.elapsed() < std::time::Duration::from_secs(10), "{:?}", started.elapsed());
+}
+
 /// The first flow control may come from the device itself.
 #[test]
 fn the_device_answers_first_frames_by_itself_where_that_is_asked_for() {

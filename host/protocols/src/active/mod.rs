@@ -11,6 +11,8 @@ pub mod sdo;
 pub mod station;
 #[cfg(test)]
 mod testing;
+#[cfg(test)]
+mod tests;
 pub mod transfer;
 
 use std::collections::VecDeque;

@@ -18,6 +18,8 @@ const MS: u64 = 1_000_000;
 const CLAIM_NS: u64 = 250 * MS;
 /// So long an answer is waited for: Tr is 200 ms, and T3 1250 ms.
 const ANSWER_NS: u64 = 1250 * MS;
+/// A message to all that has begun in time takes no longer: 255 frames, 50 ms each.
+const LONGEST_NS: u64 = 15_000 * MS;
 const GLOBAL: u8 = 255;
 const NULL: u8 = 254;
 const REQUEST: u32 = 0xEA00;
@@ -295,7 +297,7 @@ impl Station {
     }
 
     /// A whole message of somebody.
-    fn message(&mut self, now_ns: u64, header: Header, data: Vec<u8>) {
+    fn message(&mut self, header: Header, data: Vec<u8>) {
         let Phase::Waits { .. } = self.phase else { return };
         let StationJob::Request { pgn, to } = self.job else { return };
         if to != GLOBAL && header.source != to {
@@ -313,9 +315,8 @@ impl Station {
             return;
         }
         self.answers.push(GroupAnswer { from: header.source, data });
-        if to == GLOBAL {
-            self.phase = Phase::Waits { until_ns: Some(now_ns + ANSWER_NS) };
-        } else {
+        // Of all, whoever answers within the time; many say it again and again without being asked.
+        if to != GLOBAL {
             self.done();
         }
     }
@@ -377,7 +378,7 @@ impl Station {
             let incoming = self.incoming.remove(place);
             self.out.extend(incoming.last_word(self.address));
             let header = Header { pgn: incoming.pgn(), ..header };
-            self.message(now_ns, header, incoming.into_data());
+            self.message(header, incoming.into_data());
         }
     }
 
@@ -415,7 +416,9 @@ impl Machine for Station {
                 self.phase = Phase::Claims { until_ns: None };
             }
             Phase::Claims { until_ns: Some(until_ns) } if now_ns >= until_ns => self.phase = Phase::Begins,
-            Phase::Waits { until_ns: Some(until_ns) } if now_ns >= until_ns && self.incoming.is_empty() => {
+            Phase::Waits { until_ns: Some(until_ns) }
+                if now_ns >= until_ns && (self.incoming.is_empty() || now_ns >= until_ns + LONGEST_NS) =>
+            {
                 if self.answers.is_empty() {
                     self.fail(StationError::NoAnswer { after_ms: ANSWER_NS / MS });
                 } else {
@@ -475,7 +478,7 @@ impl Machine for Station {
         match (header.pgn, <[u8; 8]>::try_from(data)) {
             (CLAIM, Ok(name)) => {
                 self.claimed(header.source, u64::from_le_bytes(name));
-                self.message(now_ns, header, data.to_vec());
+                self.message(header, data.to_vec());
             }
             (REQUEST, _) if data.get(..3) == Some(&three(CLAIM)) => {
                 let asks_us = header.destination == GLOBAL || header.destination == self.address;
@@ -485,9 +488,9 @@ impl Machine for Station {
             }
             (CONTROL, Ok(data)) => self.control(now_ns, header, data),
             (DATA, Ok(data)) => self.data(now_ns, header, data),
-            (ACKNOWLEDGE, _) => self.message(now_ns, header, data.to_vec()),
+            (ACKNOWLEDGE, _) => self.message(header, data.to_vec()),
             _ if header.destination == GLOBAL || header.destination == self.address => {
-                self.message(now_ns, header, data.to_vec());
+                self.message(header, data.to_vec());
             }
             _ => {}
         }

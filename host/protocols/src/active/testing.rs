@@ -38,7 +38,7 @@ pub enum Fate {
 
 /// Runs a machine until it ends; returns the time that it took and everything that it sent.
 pub fn run(
-    machine: &mut impl Machine,
+    machine: &mut (impl Machine + ?Sized),
     peer: &mut impl Peer,
     mut fate: impl FnMut() -> Fate,
 ) -> (u64, Vec<Frame>) {

@@ -100,6 +100,11 @@ fn a_group_is_asked_for_and_answered_in_every_way() {
         }
     });
     assert_eq!(answers, Ok(vec![GroupAnswer { from: 3, data: long }]));
+    // Who says it every second by himself is heard for as long as anybody else.
+    let (answers, _) = request(GLOBAL, |say| {
+        say.extend((0..200).map(|at| (at * 1000 * MS, of(4, 0xFECA, GLOBAL, &data))));
+    });
+    assert_eq!(answers, Ok(vec![one(4), one(4)]));
     // One that stops in the middle.
     let (answers, _) = request(3, |say| {
         say.push((MS, of(3, CONTROL, GLOBAL, &[32, 20, 0, 3, 255, 0xCA, 0xFE, 0])));

@@ -45,6 +45,7 @@ mod progress;
 mod rescue;
 mod sending;
 mod shells;
+mod speaking;
 mod stderr;
 mod timing_args;
 mod trace_output;

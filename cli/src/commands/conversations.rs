@@ -14,7 +14,7 @@ use cantap_protocols::iso_tp::Pair;
 use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::Interface;
 
-use self::sheet::SheetPath;
+pub use self::sheet::SheetPath;
 use self::summary::Summary;
 use self::surveyed::Surveyed;
 use super::decode::Seconds;
@@ -129,7 +129,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
+/// Writes an event as a line.
+pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
     if json {
         return json::write(out, event);
     }

@@ -5,6 +5,7 @@ pub mod autobaud;
 pub mod bits;
 #[cfg(target_os = "linux")]
 pub mod bridge;
+pub mod canopen;
 pub mod capture;
 pub mod care;
 pub mod completions;
@@ -18,9 +19,11 @@ pub mod diff;
 pub mod extcap;
 pub mod r#gen;
 pub mod info;
+pub mod j1939;
 pub mod list;
 pub mod man;
 pub mod monitor;
+pub mod obd;
 pub mod plot;
 pub mod replay;
 pub mod search;
@@ -30,6 +33,7 @@ pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod uds;
 pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
@@ -61,6 +65,14 @@ pub enum Command {
     Capture(capture::Args),
     /// Show what the frames mean: requests and responses, transfers, by protocol.
     Conversations(conversations::Args),
+    /// Ask a vehicle by OBD-II: what it supports, live values, trouble codes, its VIN.
+    Obd(Box<obd::Args>),
+    /// Ask an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
+    Uds(Box<uds::Args>),
+    /// Talk with CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
+    Canopen(Box<canopen::Args>),
+    /// Talk with J1939 nodes: claim an address, ask for parameter groups and trouble codes, send messages.
+    J1939(Box<j1939::Args>),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -123,6 +135,10 @@ impl Command {
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
             Self::Conversations(args) => conversations::run(&args),
+            Self::Obd(args) => obd::run(&args),
+            Self::Uds(args) => uds::run(&args),
+            Self::Canopen(args) => canopen::run(&args),
+            Self::J1939(args) => j1939::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),

@@ -6,6 +6,7 @@
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
 
 pub mod eds;
+mod encode;
 mod lss;
 mod names;
 mod pdo;
@@ -14,6 +15,11 @@ mod signs;
 #[cfg(test)]
 mod tests;
 mod types;
+
+pub use encode::{BadValue, encode, type_named};
+pub use names::{abort as abort_text, state as state_name};
+pub(crate) use sdo::crc_of;
+pub use types::known as known_type;
 
 use std::borrow::Cow;
 use std::sync::Arc;

@@ -43,6 +43,7 @@ mod meter;
 mod missing;
 mod monitor;
 mod progress;
+mod protocols;
 mod rescue;
 mod sending;
 mod server;

@@ -20,16 +20,16 @@ impl Surveyed {
         Self { survey: is_wanted.then(Survey::new), waiting: Vec::new() }
     }
 
-    /// Takes the records and leaves none; whether the survey is done.
-    pub fn take(&mut self, records: &mut Vec<TraceRecord>, more: bool) -> bool {
+    /// Takes records; whether the survey is done.
+    pub fn take(&mut self, records: &[TraceRecord], more: bool) -> bool {
         let Some(survey) = &mut self.survey else {
-            self.waiting.append(records);
+            self.waiting.extend_from_slice(records);
             return true;
         };
-        for record in records.iter() {
+        for record in records {
             survey.take(record);
         }
-        self.waiting.append(records);
+        self.waiting.extend_from_slice(records);
         let spans = match (self.waiting.first(), self.waiting.last()) {
             (Some(first), Some(last)) => last.time_ns.saturating_sub(first.time_ns),
             _ => 0,

@@ -8,14 +8,14 @@ use std::sync::Arc;
 
 use cantap::TraceRecord;
 use cantap_protocols::iso_tp::Pair;
-use cantap_protocols::{Conversations, Event, Options};
+use cantap_protocols::{Conversations, Event, Options, UnderWay};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 
 use self::sheet::SheetPath;
 use self::surveyed::Surveyed;
 
-pub use known::Known;
+pub use known::{Known, about, named};
 
 /// What helps to understand a bus; for commands to flatten into theirs.
 #[derive(Clone, Debug, Default, clap::Args)]
@@ -30,6 +30,11 @@ pub struct ProtocolArgs {
 }
 
 impl ProtocolArgs {
+    /// What reads a trace for its nodes and services.
+    pub fn known(&self, quiet: bool) -> anyhow::Result<Known> {
+        Ok(Known::new(Reading::new(self.options(quiet)?, None, quiet)))
+    }
+
     /// As the library takes it; what of a sheet is not understood goes to standard error, unless `quiet`.
     pub fn options(&self, quiet: bool) -> anyhow::Result<Options> {
         let sheets = self.sheets.iter().map(|path| path.load(quiet)).collect::<anyhow::Result<Vec<_>>>()?;
@@ -40,6 +45,17 @@ impl ProtocolArgs {
 /// A condition on signals, frames, and what frames say together.
 pub fn condition(text: &str, decoder: &Decoder) -> Result<Condition, ConditionError> {
     cantap_protocols::condition(text, decoder, &Options::default())
+}
+
+/// Says which of a condition's names nothing had: a name that is misspelt would find nothing, and look as if there were nothing.
+pub fn tell_unheard(condition: &Condition) {
+    let names: Vec<_> = condition.unheard().collect();
+    if !names.is_empty() {
+        eprintln!(
+            "cantap: nothing had {}; `cantap conversations` shows what there is, with its names",
+            names.join(", ")
+        );
+    }
 }
 
 /// Reads records by the protocols that were asked for, or by those that the first records of each channel show.
@@ -59,12 +75,30 @@ impl Reading {
         Self { options, surveyed, conversations: None, events: Vec::new(), quiet }
     }
 
+    /// The transfers that have begun and have not ended.
+    pub fn under_way(&self) -> Vec<UnderWay> {
+        self.conversations.as_ref().map_or_else(Vec::new, Conversations::under_way)
+    }
+
     /// Takes records, and hands out what was said. Until it is clear what is spoken, records wait. Without `more`, this was the end.
     pub fn take<E>(
         &mut self,
         records: &[TraceRecord],
         more: bool,
         mut said: impl FnMut(Event) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.take_both(records, more, |read| match read {
+            Read::Record(_) => Ok(()),
+            Read::Event(event) => said(event),
+        })
+    }
+
+    /// The same, with the records in between: each before what it completes.
+    pub fn take_both<E>(
+        &mut self,
+        records: &[TraceRecord],
+        more: bool,
+        mut read: impl FnMut(Read<'_>) -> Result<(), E>,
     ) -> Result<(), E> {
         let Self { options, surveyed, conversations, events, quiet } = self;
         let waited;
@@ -75,7 +109,7 @@ impl Reading {
             }
             let found = surveyed.found();
             if !*quiet {
-                surveyed::tell(found.as_deref());
+                surveyed::tell(found.as_deref(), &surveyed.relatives());
             }
             options.spoken = found;
             waited = surveyed.release();
@@ -83,14 +117,23 @@ impl Reading {
         }
         let conversations = conversations.get_or_insert_with(|| Conversations::new(options));
         for record in records {
+            read(Read::Record(record))?;
             conversations.take(record, events);
             // One by one: what is freed at once is there for the next.
-            events.drain(..).try_for_each(&mut said)?;
+            events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }
         if !more {
             conversations.finish(events);
-            events.drain(..).try_for_each(&mut said)?;
+            events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
         }
         Ok(())
     }
+}
+
+/// A record, or what was said.
+pub enum Read<'a> {
+    /// The record.
+    Record(&'a TraceRecord),
+    /// What was said.
+    Event(Event),
 }

@@ -1,7 +1,7 @@
 //! What a bus speaks is told by its beginning, which is read by it as well: its records wait meanwhile.
 
 use cantap::TraceRecord;
-use cantap_protocols::{Evidence, Survey};
+use cantap_protocols::{Evidence, Relative, Survey};
 
 /// No survey looks at more records than this.
 const MOST_RECORDS: usize = 200_000;
@@ -42,6 +42,11 @@ impl Surveyed {
         self.survey.as_ref().map(Survey::found)
     }
 
+    /// What is recognised and not read.
+    pub fn relatives(&self) -> Vec<(u8, Relative)> {
+        self.survey.as_ref().map_or_else(Vec::new, Survey::relatives)
+    }
+
     /// The records that waited.
     pub fn release(&mut self) -> Vec<TraceRecord> {
         std::mem::take(&mut self.waiting)
@@ -49,9 +54,12 @@ impl Surveyed {
 }
 
 /// Says what was found.
-pub(super) fn tell(found: Option<&[Evidence]>) {
+pub(super) fn tell(found: Option<&[Evidence]>, relatives: &[(u8, Relative)]) {
     let Some(found) = found else { return };
-    if found.is_empty() {
+    for (channel, relative) in relatives {
+        eprintln!("cantap: channel {channel} has {relative}, which is recognised and not read");
+    }
+    if found.is_empty() && relatives.is_empty() {
         eprintln!(
             "cantap: no protocol is known by its first frames; name one with --protocol to read the trace by it"
         );

@@ -56,18 +56,25 @@ impl Conversations {
         for evidence in options.spoken.iter().flatten() {
             spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
         }
-        let mut this =
-            Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted };
+        let mut this = Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted };
         let decoder = || options.decoder.clone();
-        this.add(&spoken, |spoken| spoken & DIAGNOSTICS != 0, || {
-            if wanted == Protocol::IsoTp.bit() {
-                Box::new(IsoTp::new(&options.pairs, true))
-            } else {
-                Box::new(Diagnostics::new(&options.pairs, true))
-            }
-        });
+        this.add(
+            &spoken,
+            |spoken| spoken & DIAGNOSTICS != 0,
+            || {
+                if wanted == Protocol::IsoTp.bit() {
+                    Box::new(IsoTp::new(&options.pairs, true))
+                } else {
+                    Box::new(Diagnostics::new(&options.pairs, true))
+                }
+            },
+        );
         let family = |spoken: u16| spoken & VEHICLE_AND_BOAT;
-        this.add(&spoken, |spoken| family(spoken) == Protocol::J1939.bit(), || Box::new(J1939::new(decoder())));
+        this.add(
+            &spoken,
+            |spoken| family(spoken) == Protocol::J1939.bit(),
+            || Box::new(J1939::new(decoder())),
+        );
         let is_boat = |spoken| family(spoken) == Protocol::Nmea2000.bit();
         this.add(&spoken, is_boat, || Box::new(J1939::nmea2000(decoder())));
         let is_both = |spoken| family(spoken) == VEHICLE_AND_BOAT;

@@ -14,10 +14,11 @@ pub mod diagnostics;
 mod event;
 pub mod iso_tp;
 pub mod j1939;
-pub mod nmea2000;
 pub mod naming;
+pub mod nmea2000;
 mod overview;
 mod protocol;
+mod relatives;
 mod survey;
 #[cfg(test)]
 mod testing;
@@ -28,4 +29,5 @@ pub use conversations::{Conversations, Options};
 pub use event::{Event, Field, Party, Trouble, Value};
 pub use overview::{Histogram, KnownNode, KnownObject, Overview, ServiceFigures};
 pub use protocol::{Protocol, UnknownProtocol};
+pub use relatives::Relative;
 pub use survey::{Evidence, Survey};

@@ -20,7 +20,10 @@ pub const COMMON: [(&str, &str); 13] = [
     ("response_ms", "from the request to its response, in milliseconds"),
     ("frames", "how many frames it took"),
     ("length", "how many bytes of data there are"),
-    ("fault", "there, and 1, if something went wrong: a refusal, no response, a transfer that broke, frames that were lost"),
+    (
+        "fault",
+        "there, and 1, if something went wrong: a refusal, no response, a transfer that broke, frames that were lost",
+    ),
     ("trouble", "what went wrong, in a word, such as timeout"),
     ("frames_lost", "there, and 1, if frames were lost meanwhile"),
 ];
@@ -71,7 +74,11 @@ impl Event {
     /// Its fields of this name, which must be plain.
     fn named<'a>(&'a self, wanted: &'a str) -> Vec<Named<'a>> {
         let all = |wanted: &str| {
-            self.fields.iter().filter(|field| is_plain(&field.name, wanted)).map(Named::Field).collect::<Vec<_>>()
+            self.fields
+                .iter()
+                .filter(|field| is_plain(&field.name, wanted))
+                .map(Named::Field)
+                .collect::<Vec<_>>()
         };
         let own = all(wanted);
         if !own.is_empty() {
@@ -125,7 +132,8 @@ impl Said for Event {
     }
 
     fn has(&self, name: &str) -> Option<bool> {
-        let there = |named: &Named<'_>| !matches!(named, Named::Field(field) if field.value == Value::Missing);
+        let there =
+            |named: &Named<'_>| !matches!(named, Named::Field(field) if field.value == Value::Missing);
         Some(self.asked(&mut String::new(), name)?.iter().any(there))
     }
 

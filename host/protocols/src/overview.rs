@@ -111,7 +111,8 @@ impl Histogram {
             self.most_ns
         } else {
             let middle = counts.value_at_quantile(percent / 100.0);
-            (i64::try_from(middle).unwrap_or(i64::MAX).saturating_mul(UNIT_NS)).clamp(self.least_ns, self.most_ns)
+            (i64::try_from(middle).unwrap_or(i64::MAX).saturating_mul(UNIT_NS))
+                .clamp(self.least_ns, self.most_ns)
         };
         Some(ns as f64 / 1e6)
     }
@@ -131,7 +132,9 @@ impl Overview {
 
     /// By channel, protocol and name of the service.
     pub fn services(&self) -> impl Iterator<Item = ((u8, Protocol, &str), &ServiceFigures)> {
-        self.services.iter().map(|((channel, protocol, title), figures)| ((*channel, *protocol, &**title), figures))
+        self.services
+            .iter()
+            .map(|((channel, protocol, title), figures)| ((*channel, *protocol, &**title), figures))
     }
 
     /// By channel, protocol and number or identifier.
@@ -245,7 +248,11 @@ fn keep(lists: &mut BTreeMap<String, String>, list: &str, codes: String) {
 }
 
 fn short(text: String) -> String {
-    if text.chars().count() <= MOST_TEXT { text } else { text.chars().take(MOST_TEXT).chain(['…']).collect() }
+    if text.chars().count() <= MOST_TEXT {
+        text
+    } else {
+        text.chars().take(MOST_TEXT).chain(['…']).collect()
+    }
 }
 
 fn number(event: &Event, name: &str) -> Option<f64> {
@@ -282,7 +289,9 @@ fn subject(event: &Event) -> Option<Party> {
             "no_response" if matches!(event.trouble, Some(Trouble::Timeout { .. })) => known(event.to),
             _ => None,
         },
-        Protocol::DeviceNet if matches!(event.kind, "exchange" | "refusal" | "no_response") => known(event.to),
+        Protocol::DeviceNet if matches!(event.kind, "exchange" | "refusal" | "no_response") => {
+            known(event.to)
+        }
         Protocol::IsoTp => known(event.from),
         _ => event.node().map(Party::Node),
     }
@@ -316,7 +325,9 @@ fn object(event: &Event) -> Option<(String, Option<String>, Option<String>)> {
             _ => return None,
         },
         Protocol::Kwp2000 => (format!("identifier {}", field("local_identifier")?.value), None, value()),
-        Protocol::Obd => (format!("pid {} of service {}", field("pid")?.value, field("sid")?.value), meaning("pid"), None),
+        Protocol::Obd => {
+            (format!("pid {} of service {}", field("pid")?.value, field("sid")?.value), meaning("pid"), None)
+        }
         Protocol::CanOpen => match event.kind {
             "sdo_read" | "sdo_write" => {
                 let number = |name: &str| number(event, name);
@@ -377,7 +388,12 @@ mod tests {
         assert_eq!((read, figures.count, figures.faults), ("ReadDataByIdentifier", 101, 1));
         let at = |percent| figures.responses.percentile_ms(percent).unwrap();
         assert_eq!((at(0.0), at(100.0)), (1.0, 100.0));
-        assert!((at(50.0) - 50.0).abs() <= 1.0 && (at(99.0) - 99.0).abs() <= 1.0, "{} {}", at(50.0), at(99.0));
+        assert!(
+            (at(50.0) - 50.0).abs() <= 1.0 && (at(99.0) - 99.0).abs() <= 1.0,
+            "{} {}",
+            at(50.0),
+            at(99.0)
+        );
         assert_eq!((tester, silent.unanswered, silent.responses.count()), ("TesterPresent", 1, 0));
         let objects: Vec<_> = overview.objects().collect();
         assert_eq!(objects.len(), 2);
@@ -388,14 +404,25 @@ mod tests {
     fn nodes_have_their_states_codes_and_names() {
         let plant = overview(
             Protocol::CanOpen,
-            &[(0.0, "705#00"), (100.0, "705#7F"), (200.0, "705#05"), (300.0, "705#05"), (310.0, "085#1023010000000000"), (2000.0, "080#")],
+            &[
+                (0.0, "705#00"),
+                (100.0, "705#7F"),
+                (200.0, "705#05"),
+                (300.0, "705#05"),
+                (310.0, "085#1023010000000000"),
+                (2000.0, "080#"),
+            ],
         );
         let (_, node) = plant.nodes().next().unwrap();
         assert_eq!((node.state.as_deref(), node.missed), (Some("heartbeat missing"), 1));
         assert!(node.codes["emergency"].contains("0x2310"), "{:?}", node.codes);
         let truck = overview(
             Protocol::J1939,
-            &[(0.0, "18EEFF00#0100200000000010"), (5.0, "18FECA00#0000A6010305FFFF"), (9.0, "18FECA00#0000A6010305FFFF")],
+            &[
+                (0.0, "18EEFF00#0100200000000010"),
+                (5.0, "18FECA00#0000A6010305FFFF"),
+                (9.0, "18FECA00#0000A6010305FFFF"),
+            ],
         );
         let (key, node) = truck.nodes().next().unwrap();
         assert_eq!(key, (1, Protocol::J1939, "0"));

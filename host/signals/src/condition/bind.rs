@@ -220,7 +220,11 @@ impl Condition {
                     let (left, right) = if *is_left { (number, other) } else { (other, number) };
                     truth(binary(*operator, left, right))
                 };
-                if numbers.is_empty() { None } else { boolean(numbers.iter().any(|number| compare(*number) == Some(true))) }
+                if numbers.is_empty() {
+                    None
+                } else {
+                    boolean(numbers.iter().any(|number| compare(*number) == Some(true)))
+                }
             }
             Expression::SaidText(name, text) => boolean(said?.is_text(*name, text)?),
             Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record, said))?),
@@ -472,7 +476,8 @@ impl Binder<'_> {
             let slot = self.slot(name);
             let said = if slot.is_none() && part(name).is_none() { self.said(name) } else { None };
             // Without quotes it may also be another signal, or nothing at all.
-            let is_value = self.slot(wanted).is_some() || part(wanted).is_some() || self.said(wanted).is_some();
+            let is_value =
+                self.slot(wanted).is_some() || part(wanted).is_some() || self.said(wanted).is_some();
             if slot.is_none() && said.is_none() || !quoted && is_value {
                 continue;
             }

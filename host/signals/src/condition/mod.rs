@@ -21,5 +21,5 @@ mod listener;
 mod syntax;
 
 pub use bind::Condition;
-pub use listener::{Listener, Said};
 pub use error::{ConditionError, ConditionFault};
+pub use listener::{Listener, Said};

@@ -22,7 +22,7 @@ done
 gzip -t /usr/share/man/man1/cantap.1.gz
 bash -n /usr/share/bash-completion/completions/cantap
 
-cantap demo --seconds 3
+cantap demo --time 3s
 cantap capture -d virtual -b 500k -t 1s -o /tmp/virtual.log
 test "$(grep -c '#' /tmp/virtual.log)" -gt 100
 dpkg --verify cantap

@@ -1,4 +1,4 @@
-//! The measurement of a receive pin, as a host sees it: what is told, in which times, and what ends it.
+//! The measurement of a receive pin, as a host sees it: what is reported, in which times, and what ends it.
 
 mod fakes;
 

@@ -93,7 +93,7 @@ impl Channels {
         Channel::ALL.into_iter().filter(|channel| self.has(channel.number()))
     }
 
-    /// Refuses channels that so many boards do not have.
+    /// Refuses channels that this number of boards does not have.
     pub fn check(&self, boards: usize) -> anyhow::Result<()> {
         let count = boards * CHANNELS;
         match self.numbers.iter().find(|number| usize::from(**number) > count) {

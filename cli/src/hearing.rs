@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use cantap::{TraceEvent, TraceRecord};
 
-/// So long after its first error a channel that has heard no frame is told of. At any bit rate, a bus on which anything
+/// How long after its first error a channel that has heard no frame is reported. At any bit rate, a bus on which anything
 /// happens has had frames by then.
 const PATIENCE: Duration = Duration::from_secs(1);
 
@@ -41,7 +41,7 @@ impl Hearing {
         }
     }
 
-    /// The channels, from 1, that have heard errors and no frame for long enough to say so and have not been told yet.
+    /// The channels, from 1, that have heard errors and no frame for long enough to say so and have not been reported yet.
     pub fn news(&mut self, now: Instant) -> Vec<u8> {
         let is_new = |heard: &Heard| !heard.is_told && heard.has_errors_only_since(now);
         let told: Vec<u8> =
@@ -52,7 +52,7 @@ impl Hearing {
         told
     }
 
-    /// The channels, from 1, that have heard errors and no frame for long enough, told or not.
+    /// The channels, from 1, that have heard errors and no frame for long enough, reported or not.
     pub fn errors_only(&self, now: Instant) -> impl Iterator<Item = u8> {
         (1..)
             .zip(&self.channels)
@@ -60,7 +60,7 @@ impl Hearing {
             .map(|(number, _)| number)
     }
 
-    /// Whether that was told of a channel.
+    /// Whether that was reported of a channel.
     pub fn is_told(&self, number: u8) -> bool {
         self.channels.get(usize::from(number.saturating_sub(1))).is_some_and(|heard| heard.is_told)
     }

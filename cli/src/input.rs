@@ -32,7 +32,7 @@ pub struct ReadArgs {
     pub zone: Zone,
 }
 
-/// Broken lines are told one by one until it is clear that the whole file is.
+/// Broken lines are reported one by one until it is clear that the whole file is.
 const ISSUES_SHOWN: u64 = 20;
 
 /// The records of a trace or a device. Issues go to standard error.

@@ -30,7 +30,7 @@ pub struct LiveArgs {
     /// repeated. Without it, the one saved on the device.
     #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", add = completion::bit_rates())]
     bitrates: Vec<ChannelBitrate>,
-    /// Listen only for so long, as 10, 500ms or 2m.
+    /// How long to listen, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
 }
@@ -38,7 +38,7 @@ pub struct LiveArgs {
 /// How often to check whether to go on while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
-/// A device that the command goes on with when it is back; errors are told to the user.
+/// A device that the command goes on with when it is back; errors are shown to the user.
 pub type Line = Reconnecting<OpenDevice, anyhow::Error>;
 /// Several of them.
 pub type Lines = Several<OpenDevice, anyhow::Error>;
@@ -61,7 +61,7 @@ pub struct LiveRecords {
     lines: Lines,
     addresses: Vec<Address>,
     ends: Option<Instant>,
-    /// Devices that have been away for so long are not waited for.
+    /// Devices that have been away for this long are not waited for.
     give_up_after: Option<Duration>,
     /// How stopping went.
     stopped: Option<anyhow::Result<()>>,
@@ -125,7 +125,7 @@ impl LiveRecords {
         })
     }
 
-    /// Ends with an error when every device has been away for so long.
+    /// Ends with an error when every device has been away for this long.
     pub fn give_up_after(&mut self, time: Option<Duration>) {
         self.give_up_after = time;
     }

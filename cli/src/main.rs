@@ -20,7 +20,6 @@ macro_rules! eprint {
     }};
 }
 
-mod address;
 mod advice;
 mod args;
 mod beside;
@@ -46,7 +45,6 @@ mod progress;
 mod protocols;
 mod rescue;
 mod sending;
-mod server;
 mod shells;
 mod stderr;
 mod timing_args;
@@ -60,6 +58,8 @@ mod wrong;
 use std::error::Error;
 use std::process::ExitCode;
 
+use cantap_address as address;
+use cantap_address::server;
 use clap::{CommandFactory, Parser};
 use clap_complete::CompleteEnv;
 
@@ -94,7 +94,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is told as
+/// The command line is wrong, or asks for help. A device's options are a language of their own: what is wrong with one is reported as
 /// what is wrong with a condition, in one line.
 fn leave(error: &clap::Error) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());

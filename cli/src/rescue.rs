@@ -33,7 +33,7 @@ impl Rescue {
     }
 
     /// As [`Self::look`], and waits until no channel is bus-off, or Ctrl-C: what is sent meanwhile would only fail. Returns
-    /// whether it had to wait. An error is told by the next request.
+    /// whether it had to wait. An error comes with the next request.
     pub fn wait(&mut self, device: &Device) -> bool {
         let mut waited = false;
         while self.look(device).is_ok() && self.is_waiting() && !interrupt::requested() {

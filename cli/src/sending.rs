@@ -34,7 +34,7 @@ pub struct Sending<'d> {
     /// Periods that passed before their frame could leave.
     overtaken: u64,
     stands_still: bool,
-    /// What ended it, where only a yes or no could be told.
+    /// What ended it, where only a yes or no could be given.
     error: Option<anyhow::Error>,
 }
 

@@ -67,7 +67,7 @@ impl TimingArgs {
         self.bitrates = rates;
     }
 
-    /// Refuses bit rates of channels that so many boards do not have.
+    /// Refuses bit rates of channels that this number of boards does not have.
     pub fn check_channels(&self, boards: usize) -> anyhow::Result<()> {
         let count = boards * CHANNELS;
         let named = self.bitrates.iter().filter_map(|rate| rate.channel);

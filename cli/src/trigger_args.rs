@@ -24,7 +24,7 @@ pub struct TriggerArgs {
     /// Also keep what happens in this time after it held.
     #[arg(long, value_name = "TIME", default_value = "1s", requires = "trigger", value_parser = args::duration)]
     post: Duration,
-    /// End after so many events, and the time after the last one.
+    /// End after this many events, and the time after the last one.
     #[arg(long, value_name = "N", requires = "trigger", value_parser = clap::value_parser!(u64).range(1..))]
     events: Option<u64>,
     #[command(flatten)]

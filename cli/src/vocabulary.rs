@@ -36,7 +36,7 @@ const LETTERS: [(char, &[&str]); 20] = [
 /// Letters of can-utils, which users of `cangen` and `canplayer` type without looking.
 const OF_CAN_UTILS: [(&str, &str); 2] = [("gen", "DEILRcefgimpx8"), ("replay", "Igilstx")];
 
-/// Options whose values are not told by their name alone, and why.
+/// Options whose values do not follow from their name alone, and why.
 const MANY_KINDS: [(&str, &str); 6] = [
     ("count", "as in grep, search counts instead of printing; send's is a number"),
     ("id", "gen makes identifiers, search looks for them"),

@@ -227,7 +227,7 @@ fn a_capture_takes_filters_modes_and_timings() {
         frames(&out).iter().map(|frame| u32::from_str_radix(&frame[5..8], 16).unwrap()).collect();
     assert_eq!((code, ids.len()), (Some(0), 50));
     assert!(ids.iter().all(|id| id & 0x400 == 0), "{out}");
-    // What the hardware cannot express is said and filtered all the same.
+    // What the hardware cannot express is reported, and still filtered.
     let line = "capture -d virtual:frames=std8 -c 1 -b 500k --mode normal -n 20 -t 5s -f can0,000~400";
     let (code, out, err) = cantap(line);
     assert!(code == Some(0) && err.contains("no inverse filters"), "{err}");

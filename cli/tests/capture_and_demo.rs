@@ -67,7 +67,7 @@ impl Drop for Virtual {
     }
 }
 
-/// Waits until a file has grown beyond so many bytes.
+/// Waits until a file has grown beyond this many bytes.
 fn wait_for_bytes(path: &Path, bytes: u64) {
     let deadline = Instant::now() + Duration::from_secs(20);
     while std::fs::metadata(path).map_or(0, |metadata| metadata.len()) < bytes {

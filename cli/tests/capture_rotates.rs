@@ -31,7 +31,7 @@ fn records(path: &Path) -> usize {
 }
 
 /// As [`records`], of a file that was being written to: the system may have been stopped between two of its pages. Then the
-/// cut is told, and nothing else is wrong.
+/// cut is reported, and nothing else is wrong.
 fn records_of_the_last(path: &Path) -> usize {
     let items: Vec<_> = open_reader(path, &ReadOptions::default()).unwrap().collect();
     let issues: Vec<_> = items.iter().filter_map(|item| item.as_ref().err()).collect();

@@ -140,7 +140,7 @@ fn details_of_error_frames_that_are_not_kept_are_counted() {
             err.contains("error frames say more than their kind") && err.contains("(2)"),
             "{name}: {err}"
         );
-        // What was written is told whole.
+        // What was written is reported whole.
         let (_, _, err) = cantap(&directory, &["convert", name, "twice.log"]);
         assert!(!err.contains("error frames say more"), "{name}: {err}");
     }

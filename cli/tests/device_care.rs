@@ -79,7 +79,7 @@ fn what_is_no_image_never_brings_the_device_out_of_its_firmware() {
         (b"a text that is long enough to have two words", "no firmware image"),
     ] {
         std::fs::write(&other, content).unwrap();
-        // There is no such device: an open would be told first.
+        // There is no such device: an open would be reported first.
         let (code, _, err) = cantap(&folder, &["update", "-d", "/dev/nowhere", other.to_str().unwrap()]);
         assert!(code == Some(1) && err.contains(part), "{err}");
     }

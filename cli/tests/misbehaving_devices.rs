@@ -19,7 +19,7 @@ use fake_device::{FakeDevice, Fault, Log};
 use port::Port;
 use portable_pty::{PtySize, native_pty_system};
 
-/// Nothing here takes so long, however busy the machine is.
+/// Longer than anything here takes, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
 /// Frames on a channel before a device misbehaves.
 const BEFORE: u32 = 100;
@@ -172,7 +172,7 @@ fn gaps_of(records: &[TraceRecord]) -> Vec<u8> {
     gaps.map(|record| record.channel).collect()
 }
 
-/// Waits until a file grows no further than so many frames.
+/// Waits until a file grows no further than this many frames.
 fn wait_for_frames(path: &Path, count: usize) {
     let deadline = Instant::now() + PATIENCE;
     while !path.exists() || frames_of(&records(path)) < count {

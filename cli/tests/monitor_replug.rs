@@ -56,7 +56,7 @@ fn an_unplugged_device_is_missed_and_goes_on_when_it_is_back() {
     assert!((mean - 20.0).abs() < 1.0, "{back}");
     assert!(back.contains("1 reconnects"), "{back}");
 
-    // Another board in its place is told.
+    // Another board in its place is reported.
     port.unplug();
     view.wait_for("GONE, trying again");
     port.plug("load=20,frames=std8,serial=TWO");

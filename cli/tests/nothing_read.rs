@@ -1,4 +1,4 @@
-//! What cannot be read is no success, whatever the command, and nothing is left out without being told.
+//! What cannot be read is no success, whatever the command, and nothing is left out in silence.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -61,7 +61,7 @@ fn an_older_output_stays_as_it_is_where_nothing_can_be_read() {
     let (code, _, err) = cantap(&directory, &["convert", "broken.csv", "out.log"]);
     assert_eq!(code, Some(1), "{err}");
     assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "older\n");
-    // A trace without any frame is one all the same, and takes the older one's place.
+    // A trace without any frame is still a trace, and takes the older one's place.
     fs::write(directory.join("empty.log"), "").unwrap();
     let (code, _, err) = cantap(&directory, &["convert", "empty.log", "out.log"]);
     assert_eq!((code, err.as_str()), (Some(0), ""));

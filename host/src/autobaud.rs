@@ -26,7 +26,7 @@ use crate::{Device, DeviceError};
 const GOOD_FRAMES: u32 = 4;
 /// With fewer, an answer is given after this time.
 const ANSWER_AFTER: Duration = Duration::from_secs(1);
-/// The controller listens for so long at least, if it hears nothing.
+/// The controller listens for at least this long if it hears nothing.
 const LISTEN: Duration = Duration::from_millis(100);
 /// Errors without a frame between them that say that a measured rate was wrong, or that no frame ends well.
 const MOST_ERRORS: u32 = 12;
@@ -38,9 +38,9 @@ const ASK_EVERY: Duration = Duration::from_millis(2);
 const GOOD_ERROR: f64 = 0.000_3;
 /// Is what is measured not better after this time, it is taken as it is.
 const BETTER_WITHIN: Duration = Duration::from_millis(150);
-/// After one frame another may follow at once, which makes the measurement sure: a pause of so many bits says that none does.
+/// After one frame another may follow at once, which makes the measurement sure: a pause of this many bits says that none does.
 const PAUSE_BITS: f64 = 30.0;
-/// And of so long, at a high bit rate.
+/// And of this length, at a high bit rate.
 const PAUSE: Duration = Duration::from_millis(5);
 /// How far off a guess may be, as a part of the bit rate: whoever is interrupted sees edges late, and not all of them alike.
 const GUESS_ERROR: f64 = 0.004;
@@ -48,7 +48,7 @@ const GUESS_ERROR: f64 = 0.004;
 const MOST_EDGES: usize = 700;
 /// New edges that are worth a look while there is no pause: those of two frames.
 const MANY_EDGES: usize = 120;
-/// Where so much was seen for so long and not one frame was whole, a guess must do.
+/// Where this much was seen for this long and not one frame was whole, a guess must do.
 const GUESS_EDGES: u64 = 300;
 /// See [`GUESS_EDGES`].
 const GUESS_AFTER: Duration = Duration::from_millis(250);
@@ -206,7 +206,7 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
-    /// Measures until so many frames were read, or nothing new comes.
+    /// Measures until this many frames were read, or nothing new comes.
     fn measure(&mut self, wanted: u32) -> Result<Heard, DeviceError> {
         let tick_hz = f64::from(self.device.hello().tick_hz);
         // A little beyond what a device opens, so that a rate out there is named and not taken for another.

@@ -133,7 +133,7 @@ fn a_reset_beside_a_full_channel_costs_it_no_frame_where_the_banks_survive() {
 }
 
 /// Where the reset clears the banks, the other channel hears nothing until they are written again: at most one frame long, and what
-/// may be missing is told of.
+/// may be missing is reported.
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_reset_that_clears_the_banks_costs_a_full_channel_a_frame_at_most_and_is_told_of() {

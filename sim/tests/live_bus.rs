@@ -77,7 +77,7 @@ fn one_channel_sends_to_the_other_in_order_and_each_frame_is_confirmed() {
     for channel in Channel::ALL {
         rig.open(channel, normal()).unwrap();
     }
-    // Equal, rising and falling identifiers: the order is the queue's all the same.
+    // Equal, rising and falling identifiers: the order is still the queue's.
     let texts = [
         "100#01",
         "100#02",

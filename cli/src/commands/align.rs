@@ -5,9 +5,9 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use cantap_analysis::align::{Agreement, AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
 use cantap_formats::{Format, LeftOut, ReadOptions, open_reader};
 use cantap_trace::TraceRecord;
-use cantap_trace::align::{Agreement, AlignError, Alignment, RUN_LENGTHS, Sketch, Verifier, align};
 use serde_json::{Value, json};
 
 use super::convert::{WriteArgs, refuse_same_file};
@@ -143,7 +143,7 @@ fn sketch(args: &Args, path: &Path, length: usize) -> anyhow::Result<Sketch> {
         match read {
             Ok(()) => batch.iter().for_each(|record| sketch.add(record)),
             Err(issue) if args.strict => bail!(issue),
-            // It is told when the trace is read again.
+            // It is reported when the trace is read again.
             Err(_) => {}
         }
     }

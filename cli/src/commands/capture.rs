@@ -62,13 +62,13 @@ pub struct Args {
     /// Write over a file that is there already.
     #[arg(long, requires = "output")]
     force: bool,
-    /// End after so many frames.
+    /// End after this many frames.
     #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
     /// End after this time, as 10, 500ms or 2m.
     #[arg(short, long, value_parser = args::positive_duration)]
     time: Option<Duration>,
-    /// End with exit code 1 when every device has been away for so long. With -n it is 30s unless given, otherwise never: a device
+    /// End with exit code 1 when every device has been away for this long. With -n it is 30s unless given, otherwise never: a device
     /// that is back goes on.
     #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
     give_up_after: Option<Duration>,
@@ -81,7 +81,7 @@ pub struct Args {
     write: WriteArgs,
 }
 
-/// With a number of frames to wait for, devices that have been away for so long are given up.
+/// With a number of frames to wait for, devices that have been away for this long are given up.
 const GIVE_UP_AFTER: Duration = Duration::from_secs(30);
 /// How long records may stay in memory while others follow slowly.
 const FLUSH_EVERY: Duration = Duration::from_millis(200);
@@ -286,7 +286,7 @@ fn is_enough(args: &Args, sink: &Sink, meters: &Meters) -> bool {
 }
 
 /// Says what it means that channels heard errors and no frame, where that was not said on the way; an error if nothing else was
-/// heard at all. With a filter, frames may be there all the same.
+/// heard at all. With a filter, there may still be frames.
 fn judge_errors(args: &Args, live: &LiveRecords, summary: &Summary) -> anyhow::Result<()> {
     if !args.filter.is_empty() {
         return Ok(());

@@ -206,7 +206,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     };
     let output = match (output, &read) {
         (Some(output), _) => output,
-        // An empty trace is one all the same.
+        // An empty trace is still a trace.
         (None, Ok(())) => create()?,
         (None, Err(_)) => return read.map(|()| ExitCode::SUCCESS),
     };

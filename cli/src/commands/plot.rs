@@ -68,7 +68,7 @@ pub struct Args {
     /// The vertical range, LOW:HIGH.
     #[arg(long = "y", value_name = "LOW:HIGH", value_parser = vertical, allow_hyphen_values = true)]
     vertical: Option<(f64, f64)>,
-    /// Draw up to so many signals.
+    /// Draw at most this many signals.
     #[arg(long, value_name = "N", default_value_t = MOST_CURVES)]
     curves: usize,
     /// Heading; the trace's name without it.

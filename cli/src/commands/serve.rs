@@ -158,7 +158,7 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
     })
 }
 
-/// Who comes and goes is told to whoever runs it; what must not be overlooked, so that it is not.
+/// Whoever runs it sees who comes and goes; what must not be overlooked stands out.
 fn tell(news: News) {
     match news {
         News::BoardLost { .. } | News::Refused { .. } => stderr::warn(&news.to_string()),

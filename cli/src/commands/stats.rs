@@ -57,7 +57,7 @@ pub struct Args {
     /// The device's channels to listen to: 1, 2, several as 1,3, or both, which is all.
     #[arg(short, long, default_value = "both", value_parser = args::channels, add = completion::channels())]
     channel: args::Channels,
-    /// Listen only for so long.
+    /// How long to listen.
     #[arg(short = 't', long, value_name = "TIME", conflicts_with = "input", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Length of the windows that peaks are looked for in.

@@ -27,7 +27,7 @@ use crate::{args, clock, interrupt};
 pub struct Args {
     #[command(flatten)]
     device: OneBoard,
-    /// Open the channels for so long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
+    /// Open the channels for this long before asking, as 2s or 500ms; they only listen, unless --mode says otherwise.
     #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
     time: Option<Duration>,
     /// Which channels --time opens: 1, 2 or both.

@@ -7,7 +7,7 @@ pub fn seconds(ns: i64) -> String {
     format!("{sign}{}.{:06}", us / 1_000_000, us % 1_000_000)
 }
 
-/// A time of day (UTC) with so many decimals of a second, at most nine: `17:14:42.622`.
+/// A time of day (UTC) with this many decimals of a second, at most nine: `17:14:42.622`.
 pub fn clock(time_ns: i64, decimals: usize) -> String {
     const DAY_NS: i64 = 86_400_000_000_000;
     let ns = time_ns.rem_euclid(DAY_NS);

@@ -1,4 +1,4 @@
-//! What a bus speaks is told by its beginning, which is read by it as well: its records wait meanwhile.
+//! The first records show what a bus speaks. They wait meanwhile, and are then read like all others.
 
 use cantap::TraceRecord;
 use cantap_protocols::{Evidence, Relative, Survey};

@@ -149,7 +149,7 @@ pub struct Clocks {
     pub live: Errors,
 }
 
-/// Two boards on one computer, so many parts per million fast, for so many seconds of emulated time; errors count from `settled_s` on.
+/// Two boards on one computer, this many parts per million fast, for this many seconds of emulated time; errors count from `settled_s` on.
 pub fn measure(image: &Image, ppm: [f64; 2], seconds: u32, settled_s: u32) -> Result<Clocks, RigError> {
     let start = |ppm| Board::start(image.clone(), ppm).map(Box::new);
     let mut boards = [start(ppm[0])?, start(ppm[1])?];

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use portable_pty::{Child, CommandBuilder, MasterPty, PtySize, native_pty_system};
 
-/// Nothing that is waited for takes so long, however busy the machine is.
+/// Longer than anything that is waited for takes, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
 
 /// A running `cantap` and its terminal.
@@ -27,7 +27,7 @@ fn size((columns, rows): (u16, u16)) -> PtySize {
 }
 
 impl Terminal {
-    /// Starts `cantap ARGUMENTS` in a terminal of so many columns and rows.
+    /// Starts `cantap ARGUMENTS` in a terminal of this many columns and rows.
     pub fn start(arguments: &str, columns_rows: (u16, u16)) -> Self {
         Self::start_with(arguments, columns_rows, &[])
     }

@@ -1,9 +1,10 @@
 #![doc = include_str!("../README.md")]
 //!
-//! [`stats`] measures, `plot` draws.
+//! [`stats`] measures, [`align`] sets several recorders on one clock, `plot` draws.
 
 #![forbid(unsafe_code)]
 
+pub mod align;
 mod cadence;
 #[cfg(feature = "plot")]
 pub mod plot;

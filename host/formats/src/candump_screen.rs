@@ -23,7 +23,7 @@ pub(crate) struct Decoder {
     /// Whether times are differences.
     differences: bool,
     last_ns: i64,
-    /// What is to be told of the last line.
+    /// What is to be reported of the last line.
     note: Option<&'static str>,
 }
 

@@ -17,7 +17,7 @@ use cantap_trace::{Direction, TraceEvent, TraceRecord};
 #[derive(Default)]
 pub(crate) struct Decoder {
     is_decimal: bool,
-    /// To be told before anything is read.
+    /// To be reported before anything is read.
     untold: bool,
 }
 

@@ -15,11 +15,11 @@ const GZIP_LEVEL: u32 = 1;
 const ZSTD_LEVEL: i32 = 3;
 /// xz is for archives; with its default a conversion would take minutes.
 const XZ_PRESET: u32 = 1;
-/// Compressed bytes are kept until so many are together or until a flush.
+/// Compressed bytes are kept until this many are together or until a flush.
 const COMPRESSED_BYTES: usize = 512 * 1024;
 /// Of a file that is cut, a reader gets the blocks that are whole. zstd's own have 128 KiB, which can be all of a capture.
 const BLOCK_BYTES: usize = 16 * 1024;
-/// The encoder of xz keeps what it made until its stream ends: that is after so many bytes at the latest, and as many can be lost where
+/// The encoder of xz keeps what it made until its stream ends: that is after this many bytes at the latest, and as many can be lost where
 /// a file is cut. A log in such streams is 3 % larger than in streams of a megabyte, and a third smaller than gzip's.
 const XZ_STREAM_BYTES: usize = 128 * 1024;
 /// What a program that is killed loses at most, where nothing asks for a flush.
@@ -160,7 +160,7 @@ impl Compressed {
 
     /// Ends the file.
     pub(crate) fn finish(mut self) -> io::Result<()> {
-        // A file without anything in it is a compressed one all the same.
+        // A file without anything in it is still a compressed one.
         if self.begun > 0 || self.written == 0 { self.end() } else { Ok(()) }
     }
 }

@@ -90,7 +90,7 @@ impl Decode for Decoder {
                 }
                 Ok(None) => {}
                 Err(fault) if self.dialect.is_none() => {
-                    // The analyser's file begins with comments; they are told from damage by the head behind them.
+                    // The analyser's file begins with comments; the head behind them says that they are no damage.
                     self.no_head.push_back((Place::Line(line.number), fault));
                     if self.no_head.len() > MAX_COMMENTS
                         && let Some((place, fault)) = self.no_head.pop_front()

@@ -13,7 +13,7 @@ const DETAILS_LEFT_OUT: &str =
 #[derive(Default)]
 pub(super) struct ErrorFrames {
     records: VecDeque<TraceRecord>,
-    /// Frames whose details are left out, to be told.
+    /// Frames whose details are left out, to be reported.
     untold: u64,
 }
 
@@ -43,7 +43,7 @@ impl ErrorFrames {
         self.note().map(Found::Note)
     }
 
-    /// What is to be told of the frames that were read.
+    /// What is to be reported of the frames that were read.
     pub(super) fn note(&mut self) -> Option<&'static str> {
         self.untold = self.untold.checked_sub(1)?;
         Some(DETAILS_LEFT_OUT)

@@ -153,7 +153,7 @@ impl Format {
             .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
     }
 
-    /// Whether both are read by the same reader: versions and dialects are told by the content.
+    /// Whether both are read by the same reader: the content says which version or dialect it is.
     pub fn is_kind_of(self, other: Self) -> bool {
         std::mem::discriminant(&self) == std::mem::discriminant(&other)
     }

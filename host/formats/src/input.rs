@@ -281,7 +281,7 @@ impl Input {
         &self.buffer[self.start..self.end]
     }
 
-    /// Uses up so many lines that [`Self::buffered`] showed, `len` bytes in all.
+    /// Uses up this many lines that [`Self::buffered`] showed, `len` bytes in all.
     pub(crate) fn consume_lines(&mut self, len: usize, lines: u64) {
         self.consume(len);
         self.lines += lines;

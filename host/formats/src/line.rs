@@ -99,7 +99,7 @@ impl<const WIDTH: usize> Seconds<WIDTH> {
         self.last = seconds;
     }
 
-    /// Appends a time of so many microseconds as seconds, the whole ones aligned to the right of the width, with six
+    /// Appends a time in microseconds as seconds, the whole ones aligned to the right of the width, with six
     /// decimals.
     #[inline]
     pub(crate) fn put(&mut self, line: &mut Line, us: u64) {

@@ -75,7 +75,7 @@ pub struct TraceReader {
     ended: bool,
     /// How many were decoded.
     records: u64,
-    /// The format that the name told, where the content told another one.
+    /// The format that the name says, where the content says another one.
     named: Option<Format>,
     head: Vec<u8>,
 }
@@ -219,7 +219,7 @@ impl TraceReader {
         self.issues
     }
 
-    /// What is nothing wrong and should be known all the same, such as requests to send a frame that were passed over: so
+    /// What is not wrong and should still be known, such as requests to send a frame that were passed over: so
     /// far, and how often.
     pub fn notes(&self) -> &LeftOut {
         &self.notes

@@ -40,7 +40,7 @@ pub(crate) enum Packet {
     LeftOut(&'static str),
 }
 
-/// Reads packets, and knows what is still to be told of them.
+/// Reads packets, and knows what is still to be reported of them.
 #[derive(Default)]
 pub(crate) struct Packets {
     pub errors: ErrorFrames,

@@ -198,7 +198,7 @@ pub(crate) fn eight_bytes(digits: &[u8; 16]) -> Option<[u8; 8]> {
     (seen < 16).then_some(bytes)
 }
 
-/// A decimal number of exactly so many digits, at most 18, tested once for all of them.
+/// A decimal number of exactly this many digits, at most 18, tested once for all of them.
 #[inline]
 pub(crate) fn digits<const N: usize>(digits: &[u8; N]) -> Option<i64> {
     const { assert!(N <= 18, "more digits than an i64 holds") };

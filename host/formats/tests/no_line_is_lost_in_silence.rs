@@ -54,7 +54,7 @@ impl Text {
         Self { format, head: lines.concat(), rows: rows.into_iter().take(LINES).collect() }
     }
 
-    /// As another program writes it: `row` is told the record's number, identifier, whether that is extended, and its bytes.
+    /// As another program writes it: `row` is given the record's number, identifier, whether that is extended, and its bytes.
     fn foreign(format: Format, head: &str, row: impl Fn(usize, u32, bool, &[u8]) -> String) -> Self {
         let rows = records(false).into_iter().enumerate().map(|(at, record)| {
             let frame = record.frame().unwrap();

@@ -46,7 +46,7 @@ impl Conversations {
     pub fn new(options: &Options) -> Self {
         let bits = |protocols: &[Protocol]| protocols.iter().fold(0, |bits, protocol| bits | protocol.bit());
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
-        // Without a survey and a choice, what is not told apart by its frames would be read twice.
+        // Without a survey and a choice, frames that two protocols could claim would be read twice.
         let everywhere = match (&options.spoken, options.protocols.is_empty()) {
             (Some(_), _) => 0,
             (None, true) => DIAGNOSTICS,

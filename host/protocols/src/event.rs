@@ -73,7 +73,7 @@ pub struct Field {
 pub enum Value {
     /// A whole number that people know in decimal.
     Number(i64),
-    /// A number that people know in hexadecimal, with at least so many digits.
+    /// A number that people know in hexadecimal, with at least this many digits.
     Hex(u64, u8),
     /// A physical value.
     Real(f64),

@@ -47,7 +47,7 @@ const RETRY_AFTER: Duration = Duration::from_millis(500);
 const HELLO_TRIES: u32 = 3;
 /// So long for each try, and for each other question before there are clients.
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
-/// So long a server that ends waits for what its clients are to be told.
+/// How long a server that ends waits for its clients to take its last words.
 const LAST_WORDS: Duration = Duration::from_millis(1500);
 /// Read at a time.
 const READ_BYTES: usize = 64 * 1024;

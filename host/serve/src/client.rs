@@ -26,9 +26,9 @@ const GREETING_TIMEOUT: Duration = Duration::from_secs(5);
 const STOP_TIMEOUT: Duration = Duration::from_secs(1);
 /// What a board has captured when it is asked for its time has arrived by then.
 const SETTLE_TIMEOUT: Duration = Duration::from_millis(30);
-/// Frames that are given up have been told by then.
+/// Frames that are given up have been reported by then.
 const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
-/// A client whose frames find the board's queue full, perhaps of another's, waits so long before it is told.
+/// A client whose frames find the board's queue full, perhaps of another's, waits this long before it is refused.
 const ROOM_TIMEOUT: Duration = Duration::from_millis(800);
 
 /// Lets a client in. Two threads of its own serve it until either side ends.
@@ -107,7 +107,7 @@ struct Client {
     id: ClientId,
     role: Role,
     name: String,
-    /// Nobody is told of those who only knock.
+    /// Those who only knock are not reported to anybody.
     has_greeted: Arc<AtomicBool>,
     outbox: Arc<Outbox>,
 }
@@ -442,7 +442,7 @@ impl Client {
         Ok(())
     }
 
-    /// Takes the client's frames out of the board's queue. What others have in it is sent all the same.
+    /// Takes the client's frames out of the board's queue. What others have in it is still sent.
     fn withdraw(&self, channel: Channel, is_closed: bool) -> Result<(), Refusal> {
         {
             let mut state = self.shared.state();

@@ -16,7 +16,7 @@ use crate::{Board, News};
 
 /// Records that wait for one client at most, beside what waits in the server's queue.
 pub(crate) const HELD_RECORDS: usize = 1 << 16;
-/// A client that takes nothing for so long is gone.
+/// A client that takes nothing for this long is gone.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// How long to wait for records before looking at the other board's.
 const WAIT: Duration = Duration::from_millis(10);

@@ -17,7 +17,7 @@ use crate::stream::ClientId;
 
 /// Longest answer of a board: saving takes two seconds.
 const ANSWER_TIMEOUT: Duration = Duration::from_secs(3);
-/// A board makes us wait while it has no room; one that takes nothing for so long is stuck.
+/// A board makes us wait while it has no room; one that takes nothing for this long is stuck.
 pub(crate) const WRITE_PATIENCE: Duration = Duration::from_secs(2);
 
 /// How a board is shared.

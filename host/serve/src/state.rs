@@ -33,7 +33,7 @@ pub struct Sent {
     pub channel: Channel,
     /// Another client's frames are being withdrawn: this one is sent again.
     pub keep: bool,
-    /// The client has closed the channel, which is how its end is told.
+    /// The client has closed the channel, which is how its end is reported.
     pub is_closed: bool,
 }
 

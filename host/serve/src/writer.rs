@@ -15,7 +15,7 @@ use crate::stream::{ClientId, Views, shown};
 
 /// How often to check whether the connection is over while there is nothing to write.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
-/// A client that takes nothing for so long is gone: a peer that was switched off says nothing.
+/// A client that takes nothing for this long is gone: a peer that was switched off says nothing.
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// Writes until nothing follows. An error says why the client is let go.

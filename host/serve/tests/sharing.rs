@@ -99,7 +99,7 @@ fn a_slow_client_loses_counted_frames_at_stage_host_and_holds_up_nobody() {
     let settings = Settings { most_records: 2000, ..Settings::at(FAST_BPS) };
     let (board, _told) = board_at("load=100,frames=std8", settings);
     let good = client(&board, "good", Role::Listen);
-    // A link that reads nothing while it is told so: not for so long that the device is given up as silent.
+    // A link that reads nothing on demand, but not long enough for the device to be given up as silent.
     let gate = std::sync::Arc::new(std::sync::atomic::AtomicBool::new(false));
     let Link { reader, writer, keep_alive } = board.link("slow", Role::Listen).unwrap();
     let gated = Gated { reader, gate: gate.clone() };
@@ -183,7 +183,7 @@ fn a_listener_changes_nothing_and_is_told_what_it_would_take() {
     let periodic =
         Periodic { frame: frame.frame, period_ticks: 100_000, count: 0, modifiers: heapless_none() };
     assert_eq!(refusal(device.set_periodic(Channel::Can1, 0, Some(periodic))), not_granted(Role::Send));
-    // What was refused is told in words.
+    // What was refused is said in words.
     let said = device.send(Channel::Can1, &[frame]).unwrap_err().to_string();
     assert_eq!(
         said,

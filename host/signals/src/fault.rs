@@ -153,7 +153,7 @@ pub enum FaultKind {
 }
 
 impl FaultKind {
-    /// Whether the message can be used all the same. Everything else makes values wrong.
+    /// Whether the message can still be used. Everything else makes values wrong.
     pub fn is_warning(&self) -> bool {
         matches!(
             self,

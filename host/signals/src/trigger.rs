@@ -23,7 +23,7 @@ pub struct Window {
     pub pre_ns: i64,
     /// How long after the event records are kept, in nanoseconds.
     pub post_ns: i64,
-    /// Only so many events count: those after them do not lengthen the time. All without it.
+    /// Only this many events count: those after them do not lengthen the time. All without it.
     pub events: Option<u64>,
 }
 

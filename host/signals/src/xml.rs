@@ -6,7 +6,7 @@ use roxmltree::{Document, Node, ParsingOptions};
 
 use super::fault::{DatabaseError, Fault, FaultKind};
 
-/// A range of values that one text stands for is written out up to so many of them.
+/// A range of values that one text stands for is written out up to this many of them.
 pub const MOST_TEXTS: i64 = 4096;
 
 /// The text of an XML file: UTF-8, UTF-16 with its mark, or else Windows' Western code page.

@@ -30,6 +30,7 @@ use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
 use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
+pub use buffer::Buffer;
 pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,
@@ -93,7 +94,7 @@ impl Device {
         Self::over_holding(link, name, BUFFER_RECORDS)
     }
 
-    /// The same, and at most so many records wait for who takes them; others are lost, and counted.
+    /// The same, and at most this many records wait to be taken; others are lost, and counted.
     pub fn over_holding(link: Link, name: &str, records: usize) -> Result<Self, DeviceError> {
         let Link { reader, writer, keep_alive } = link;
         let shared = Arc::new(Shared::new(name, writer, records));

@@ -13,7 +13,7 @@ use crate::{TraceFrame, TraceRecord};
 /// A kind of frame: channel, identifier, and whether it is remote, or an FD one.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Key {
-    /// From 1; 0 if channels are not told apart.
+    /// From 1; 0 if channels are not distinguished.
     pub channel: u8,
     /// The identifier.
     pub id: Id,

@@ -5,7 +5,6 @@
 
 #![forbid(unsafe_code)]
 
-pub mod align;
 pub mod diff;
 pub mod fd;
 mod fd_bits;

@@ -16,7 +16,7 @@ const MOST_PAUSE_TICKS: u64 = 1 << 28;
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Measuring {
     pub(super) channel: Channel,
-    /// The last edge that was told, or the beginning.
+    /// The last edge that was reported, or the beginning.
     last: u64,
     /// When the host asked last.
     asked: u64,

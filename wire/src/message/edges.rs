@@ -9,7 +9,7 @@ pub const MAX_EDGES: usize = 64;
 /// What was measured on a receive pin since the last answer. Where there are [`MAX_EDGES`], there are more to be asked for.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 pub struct Edges {
-    /// Device time, in ticks, up to which all edges have been told, if there are fewer than [`MAX_EDGES`] here.
+    /// Device time, in ticks, up to which all edges have been reported, if there are fewer than [`MAX_EDGES`] here.
     pub ticks: u64,
     /// The pin's level now: dominant, or recessive.
     pub dominant: bool,

@@ -87,7 +87,7 @@ impl TriggerSummary {
 }
 
 impl Summary {
-    /// Of what these devices heard in so many seconds, by channel; neither a trigger nor a file is known of yet.
+    /// Of what these devices heard in this many seconds, by channel; neither a trigger nor a file is known of yet.
     pub fn of(seconds: f64, channels: Vec<ChannelSummary>, live: &LiveRecords, boards: &Boards) -> Self {
         let gaps = live.lines().lines().map(Line::gaps);
         let gaps = gaps.fold(Gaps::default(), |sum, gaps| Gaps {

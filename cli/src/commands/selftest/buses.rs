@@ -93,7 +93,7 @@ fn is_clean(flow: &Flow) -> bool {
     flow.is_accounted_for() && flow.lost == 0 && flow.bus_errors == 0
 }
 
-/// Frames for later fill the queue to its end; taken back, each is told.
+/// Frames for later fill the queue to its end; taken back, each is reported.
 pub fn fill_queue(device: &Device, channel: Channel) -> Result {
     open(device, channel, BITRATE_BPS, Mode::SilentLoopback)?;
     let ends = device.transmissions();
@@ -193,7 +193,7 @@ pub fn cross(device: &Device, bitrate_bps: u32) -> Result {
 }
 
 /// One channel sends while the other only listens: nobody acknowledges, so the frame never ends, and the sender stops counting
-/// at error-passive. Whether it keeps that over Close and Open is the controller's business, and told.
+/// at error-passive. Whether it keeps that over Close and Open is the controller's business, and reported.
 pub fn unacknowledged(device: &Device, sender: Channel) -> Result {
     let listener = if sender == Channel::Can1 { Channel::Can2 } else { Channel::Can1 };
     open(device, listener, BITRATE_BPS, Mode::ListenOnly)?;

@@ -80,7 +80,7 @@ pub struct SignalTable {
 }
 
 impl SignalTable {
-    /// Nothing seen yet. The values of signals in the graph take so many bytes at most.
+    /// Nothing seen yet. The values of signals in the graph take at most this many bytes.
     pub fn new(decoder: Arc<Decoder>, room: usize) -> Self {
         Self {
             decoder,
@@ -303,7 +303,7 @@ impl SignalTable {
         decoded.collect()
     }
 
-    /// As [`Self::text`] in so many columns: digits go before the unit does.
+    /// As [`Self::text`] in this many columns: digits go before the unit does.
     pub fn short_text(&self, row: &SignalRow, columns: usize) -> String {
         let text = self.text(row);
         let signal = self.signal(row);

@@ -134,7 +134,7 @@ impl Source<'_> {
 
     /// Ends the session; what was captured until then is shown and recorded.
     fn end(&mut self, lines: &mut Lines) {
-        // If that fails a device has just gone, and what was ordered counts all the same.
+        // If that fails a device has just gone, and what was ordered still counts.
         let _ = lines.stop();
         loop {
             match lines.next(WAIT).1 {
@@ -335,7 +335,7 @@ fn open_as(plan: &Plan) -> Lines {
     let for_setup = plan.clone();
     lines(&plan.addresses, move |board, device| {
         let open = for_setup.open.on_board(board);
-        // No filters, saved ones neither: what is not shown is recorded all the same.
+        // No filters, saved ones neither: what is not shown is still recorded.
         open.open(device, for_setup.channels_of(board), for_setup.mode(), None).map(|_| ())
     })
 }

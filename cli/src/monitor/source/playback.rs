@@ -100,7 +100,7 @@ impl Drop for Length {
     }
 }
 
-/// A file is played for so long before its length is looked for: a short one may be over by then.
+/// A file is played this long before its length is looked for: a short one may be over by then.
 const LENGTH_AFTER: Duration = Duration::from_millis(300);
 
 /// What plays a file.

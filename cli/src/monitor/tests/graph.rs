@@ -170,7 +170,7 @@ fn a_signal_that_is_chosen_late_has_its_past_and_what_fell_out_is_told() {
     let (high, low) = (lane.matches('▔').count(), lane.matches('▁').count());
     assert!((40..50).contains(&high) && (40..50).contains(&low), "{screen}");
     assert!(!screen.contains("nothing is kept"), "{screen}");
-    // Within a memory of its own, which is told, the oldest makes room.
+    // Within a memory of its own, which is shown, the oldest makes room.
     model.take(&(20_000..200_000).map(|n| sample(n * MS, 1, 0)).collect::<Vec<_>>());
     let (values, used, most) = model.seen.signals.graph_memory();
     assert!(used <= most && most == 1_000_000 && values > 50_000, "{values} {used} {most}");

@@ -26,7 +26,7 @@ fn every_key_that_does_something_is_in_the_help() {
     let letters: BTreeSet<char> = SOURCES.iter().flat_map(|source| letters(source)).collect();
     assert!(letters.len() > 40 && letters.is_superset(&BTreeSet::from(['m', 'A', '{', '#'])), "{letters:?}");
     let told: BTreeSet<&str> = KEYS.iter().flat_map(|(keys, _)| keys.split([' ', ','])).collect();
-    // Page numbers are told as a range, blank by its name, k and j are the arrows' doubles, Ctrl-J is Enter.
+    // Page numbers are shown as a range, blank by its name, k and j are the arrows' doubles, Ctrl-J is Enter.
     let otherwise = ['1', '8', ' ', 'j', 'k', 'z', 'u', 'h', '?', ','];
     let missing: Vec<_> = letters
         .iter()

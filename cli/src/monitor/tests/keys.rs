@@ -173,7 +173,7 @@ fn a_filter_hides_what_was_seen_before_too_and_gives_it_back() {
         assert!(text.contains("FILTER") && text.contains("CogSogRapid"), "{text}");
         assert!(!text.contains("PositionRapid") && !text.contains("09F80102"), "{text}");
     }
-    // Losses are told whatever is filtered.
+    // Losses are shown whatever is filtered.
     assert!(show(View::Trace, &mut app, &model).contains("17 frames lost"));
     let listed = model.history.end() - model.history.first();
     assert!((300..1000).contains(&listed), "{listed}");
@@ -218,7 +218,7 @@ fn while_the_display_stands_still_rows_can_be_hidden_and_values_do_not_move() {
         let moved = TraceRecord { event: super::frame("09F80202#01FC6C000001FFFF"), ..last };
         model.take(&[TraceRecord { time_ns: last.time_ns + 1_000_000_000, ..moved }; 30]);
         let after = page(screen_text(&mut app, &model, (110, 30)).unwrap());
-        // The memory in use is told as it is.
+        // The memory in use is shown as it is.
         let told =
             |lines: &[String]| lines.iter().filter(|line| !line.starts_with("Memory")).cloned().collect();
         let (before, after): (Vec<String>, Vec<String>) = (told(&before), told(&after));

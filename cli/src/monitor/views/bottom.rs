@@ -116,7 +116,7 @@ fn question(kind: PromptKind) -> &'static str {
     }
 }
 
-/// What there is to be told.
+/// What there is to say.
 fn said(app: &App, model: &Model) -> Option<String> {
     if !app.message.is_empty() {
         return Some(app.message.clone());

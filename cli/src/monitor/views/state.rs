@@ -19,12 +19,12 @@ use super::list::bytes;
 
 /// Characters of an address that there is room for beside the rest, on a wide screen and on a narrow one.
 const MOST_ADDRESS: [usize; 2] = [32, 16];
-/// Windows whose mean is the rate that is told: a second.
+/// Windows whose mean is the rate shown: a second.
 const RATE_WINDOWS: usize = 4;
 /// Fewer columns are no bar.
 const LEAST_BAR: usize = 10;
 
-/// How much is told of each channel, as far as there is room.
+/// How much is shown of each channel, as far as there is room.
 #[derive(Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Detail {
     Nothing,
@@ -59,7 +59,7 @@ fn width(spans: &[Span<'_>]) -> usize {
     spans.iter().map(|span| span.content.chars().count()).sum()
 }
 
-/// What stands there, with so much of each channel and so many characters of an address.
+/// What stands there, with this much of each channel and this many characters of an address.
 fn line(app: &App, model: &Model, detail: Detail, most_address: usize) -> Vec<Span<'static>> {
     let theme = app.theme;
     let style = match model.source {

@@ -30,11 +30,11 @@ pub(crate) struct Decoder {
     objects: Vec<u8>,
     at: usize,
     decompressor: Decompress,
-    /// Something wrong with the container whose objects are being read; told after them.
+    /// Something wrong with the container whose objects are being read; reported after them.
     fault: Option<(Place, Fault)>,
     /// Offset of the container.
     container: u64,
-    /// The last object was a comment that already told what a loss object would.
+    /// The last object was a comment that already said what a loss object would.
     loss_told: bool,
 }
 
@@ -121,7 +121,7 @@ impl Decode for Decoder {
 }
 
 impl Decoder {
-    /// The file's header. A file without it is read all the same, from the first object on.
+    /// The file's header. A file without it is still read, from the first object on.
     fn head(&mut self, input: &mut Input) -> io::Result<Option<Fault>> {
         self.started = true;
         let head = input.peek(FILE_HEADER_BYTES)?;
@@ -136,7 +136,7 @@ impl Decoder {
             return Ok(Some(Fault::malformed("a BLF file, which begins with LOGG", found)));
         }
         let len = u32_at(head, 4) as usize;
-        // A cut is told once.
+        // A cut is reported once.
         self.file_bytes = if cut { 0 } else { u64_at(head, FILE_BYTES_OFFSET) };
         self.start_ns = self.zone.utc_ns(system_time(&head[START_OFFSET.min(head.len())..]));
         input.consume(if (START_OFFSET..=4096).contains(&len) { len } else { FILE_HEADER_BYTES });

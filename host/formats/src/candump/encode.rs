@@ -57,7 +57,7 @@ impl Encode for Encoder {
             }
             event => {
                 // Every event but a frame has an error frame. python-can takes one without this class for
-                // a frame on the bus; bus-off stays as the kernel has it all the same.
+                // a frame on the bus; bus-off still stays as the kernel has it.
                 if let Some(ErrorFrame { classes, data }) = ErrorFrame::of(event) {
                     let is_bus_off = classes & cantap_trace::socketcan::BUS_OFF != 0;
                     let class = if is_bus_off { 0 } else { BUS_ERROR };

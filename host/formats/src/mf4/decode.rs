@@ -36,7 +36,7 @@ const MAX_VALUE_BYTES: usize = 1 << 20;
 #[derive(Default)]
 pub(crate) struct Decoder {
     open: Option<Opened>,
-    /// What is to be told before the records.
+    /// What is to be reported before the records.
     first: VecDeque<Found>,
 }
 
@@ -119,7 +119,7 @@ impl Decode for Decoder {
     }
 }
 
-/// Errors of the system end the reading; others are told.
+/// Errors of the system end the reading; others are reported.
 fn own(fault: Fault) -> io::Result<Fault> {
     match fault {
         Fault::Io(error) => Err(error),

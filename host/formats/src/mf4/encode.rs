@@ -48,7 +48,7 @@ struct Kind {
     parts: &'static [Part],
 }
 
-/// The fields of a frame with so many bytes.
+/// The fields of a frame with this many bytes.
 const fn with_bytes(bytes: u32) -> [Part; 10] {
     let mut parts = FRAME_PARTS;
     parts[9].3 = 8 * bytes;

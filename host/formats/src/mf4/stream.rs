@@ -6,7 +6,7 @@ use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
 
-/// Plain data is read in pieces of so many bytes.
+/// Plain data is read in pieces of this many bytes.
 const PIECE_BYTES: u64 = 1 << 20;
 
 /// The standard has at most 4 MiB in a compressed block; other programs write more. Larger is damage.
@@ -137,7 +137,7 @@ impl Stream {
         Ok(())
     }
 
-    /// `len` bytes from a place on; `None` if the stream has not so many there.
+    /// `len` bytes from a place on; `None` if the stream has fewer there.
     pub(super) fn at(&mut self, file: &mut Whole, at: u64, len: usize) -> Result<Option<&[u8]>, Fault> {
         let Some(end) = at.checked_add(len as u64).filter(|end| *end <= self.len) else { return Ok(None) };
         let is_held = |stream: &Self| {

@@ -29,7 +29,7 @@ pub(crate) struct Decoder {
     has_start: bool,
     has_rows: bool,
     layout: Layout,
-    /// The row before told an event exactly; a row of the format's own for it follows.
+    /// The row before gave an event exactly; a row of the format's own for it follows.
     told: Option<TraceRecord>,
     /// Of the dates.
     zone: Zone,
@@ -40,7 +40,7 @@ enum Row {
     Record(TraceRecord),
     /// A known thing that is no part of a trace of CAN, by kind.
     LeftOut(&'static str),
-    /// Of the head, or told by the row before.
+    /// Of the head, or given by the row before.
     Nothing,
 }
 

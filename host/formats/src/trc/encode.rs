@@ -295,7 +295,7 @@ impl Encoder {
 
     /// An event in a row of version 1: a warning or an error, with the exact text behind it.
     fn event_1(&self, record: &TraceRecord, out: &mut Vec<u8>) {
-        // In 1.0 only a warning's row is told from a frame's by everybody.
+        // In 1.0 only a warning's row can be distinguished from a frame's by everybody.
         let error = match record.event {
             TraceEvent::BusError { kind, counters } if self.version > TrcVersion::V1_0 => {
                 Some((error_code(kind), counters.unwrap_or_default()))

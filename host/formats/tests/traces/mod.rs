@@ -25,7 +25,7 @@ pub const ODD: &str = "(1410714882.000000) can0 000#\n\
     (1410714884.000001) can0 20000040#0000000000000000\n\
     (1410714884.100000) can1 321#AA\n";
 
-/// A format's file name, so that reading finds the format without being told.
+/// A format's file name, so that reading finds the format by itself.
 pub fn file_name(format: Format, compression: &str) -> String {
     let suffix = match format {
         Format::Candump | Format::Busmaster => "log",

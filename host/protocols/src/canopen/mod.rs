@@ -1,6 +1,6 @@
 //! CANopen (CiA 301): network management, boot-up, heartbeat and guarding, SYNC, TIME, EMCY, SDO, PDO, LSS (CiA 305).
 //!
-//! What comes again and again is told when it changes: a node's state, a heartbeat that stops and comes back, the first SYNC and a
+//! What comes again and again is reported when it changes: a node's state, a heartbeat that stops and comes back, the first SYNC and a
 //! counter that jumps. PDOs have names and values where an EDS or SDO transfers that were heard say what they carry.
 //!
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
@@ -29,7 +29,7 @@ pub(crate) use self::signs::CanOpenSigns;
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const SWEEP_NS: i64 = 50_000_000;
-/// A heartbeat is missed after so many of its periods.
+/// A heartbeat is missed after this many of its periods.
 const MISSED_PERIODS: f64 = 2.5;
 /// How long a node may take to answer a guard.
 const GUARD_NS: i64 = 500_000_000;

@@ -312,7 +312,7 @@ impl Sdo {
         None
     }
 
-    /// The receiver has taken so many frames of the block.
+    /// The receiver has taken this many frames of the block.
     fn confirm_block(&mut self, taken: u8) {
         self.phase = Phase::Command;
         let ours = self.block_next - 1;

@@ -32,7 +32,7 @@ const SWEEP_NS: i64 = 100_000_000;
 const MOST_OPEN: usize = 256;
 /// Bytes that are kept of one.
 const MOST_BYTES: usize = 1 << 16;
-/// A transfer of a pair that was only just found is told as broken from so many frames on; before, it was none.
+/// A transfer of a pair that was only just found is reported as broken from this many frames on; before, it was none.
 const FRAMES_THAT_CONVINCE: u32 = 4;
 
 /// A transfer under way.
@@ -53,7 +53,7 @@ pub struct Transport {
     pairs: Pairs,
     finder: Option<Finder>,
     open: FxHashMap<(u8, Endpoint), Open>,
-    /// Runs of consecutive frames without a first one: the last number of each, so that a run is told once.
+    /// Runs of consecutive frames without a first one: the last number of each, so that a run is reported once.
     headless: FxHashMap<(u8, Endpoint), u8>,
     sweep_ns: i64,
 }
@@ -245,7 +245,7 @@ impl Transport {
         out: &mut impl FnMut(Transfer),
     ) {
         let Some(open) = self.open.get_mut(&key) else {
-            // The rest of a transfer that has ended already, or whose beginning was not heard, is told once.
+            // The rest of a transfer that has ended already, or whose beginning was not heard, is reported once.
             if self.headless.len() >= MOST_OPEN {
                 self.headless.clear();
             }
@@ -267,7 +267,7 @@ impl Transport {
         if number != open.next {
             let trouble = Trouble::Sequence { expected: open.next.into(), got: number.into() };
             if let Some(open) = self.open.remove(&key) {
-                // What follows it belongs to what has just been told.
+                // What follows it belongs to what has just been reported.
                 self.headless.insert(key, number);
                 end(open, trouble, out);
             }

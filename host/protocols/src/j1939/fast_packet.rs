@@ -22,7 +22,7 @@ type Key = (u8, u8, u8, u32, u8);
 pub struct FastPackets {
     /// With the number of the next frame.
     open: FxHashMap<Key, (Assembled, u8)>,
-    /// Packets that ended early, or whose beginning was not heard: the rest of each is told once.
+    /// Packets that ended early, or whose beginning was not heard: the rest of each is reported once.
     headless: FxHashMap<Key, u8>,
     sweep_ns: i64,
 }

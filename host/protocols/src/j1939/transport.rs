@@ -71,7 +71,7 @@ pub(super) struct Open {
     pub message: Assembled,
     /// The next frame, from 1 (of the whole message).
     pub next: u32,
-    /// Frames that were told to come before the window of an extended transfer.
+    /// Frames that were announced before the window of an extended transfer.
     offset: u32,
     /// A frame came out of order, and the receiver has not asked for it again so far.
     gap: Option<Trouble>,
@@ -81,7 +81,7 @@ pub(super) struct Open {
 #[derive(Clone, Debug, Default)]
 pub struct LongMessages {
     open: FxHashMap<(u8, u8, u8, bool), Open>,
-    /// Messages that ended early, or whose beginning was not heard: the last frame of each, so that its rest is told once.
+    /// Messages that ended early, or whose beginning was not heard: the last frame of each, so that its rest is reported once.
     headless: FxHashMap<(u8, u8, u8, bool), u8>,
     sweep_ns: i64,
 }

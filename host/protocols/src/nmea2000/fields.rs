@@ -358,7 +358,7 @@ fn physical(name: &'static str, kind: &'static FieldKind, raw: u64) -> Field {
     }
     let resolution = kind.resolution.unwrap_or(1.0);
     let number = if kind.signed { signed(raw, length) } else { raw as f64 };
-    // The second highest says that there was an error, where so many values are set aside.
+    // The second highest says that there was an error, where that many values are set aside.
     let most = kind.range_max.map_or(f64::INFINITY, |most| (most - kind.offset) / resolution);
     if length > 3 && raw == none - 1 && number > most + 0.5 {
         return Field::missing(name).meaning(Some("error"));

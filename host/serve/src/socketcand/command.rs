@@ -25,7 +25,7 @@ pub enum Command {
     Update(Frame),
     /// Send it no more.
     Delete(Id),
-    /// Hear an identifier; at most one frame in so many microseconds.
+    /// Hear an identifier; at most one frame in this many microseconds.
     Subscribe(u64, Id),
     /// Hear an identifier when bits of its data change that count.
     Filter(u64, Id, Vec<u8>),
@@ -33,7 +33,7 @@ pub enum Command {
     MuxFilter(u64, Id, Vec<[u8; 8]>),
     /// Hear an identifier no more.
     Unsubscribe(Id),
-    /// Statistics each so many milliseconds; 0 for none.
+    /// Statistics once in this many milliseconds; 0 for none.
     Statistics(u64),
     /// Answer.
     Echo,

@@ -1,4 +1,4 @@
-//! Which records one client is told, and what it counts.
+//! Which records one client is given, and what it counts.
 
 use std::collections::HashMap;
 use std::fmt::Write;
@@ -62,13 +62,13 @@ impl Hearing {
         self.statistics.told_at = Some(Instant::now());
     }
 
-    /// How long nothing may be told.
+    /// How long nothing may be passed on.
     pub fn wait(&self) -> Option<Duration> {
         let wait = self.from?.saturating_duration_since(Instant::now());
         (!wait.is_zero()).then_some(wait)
     }
 
-    /// Takes records, and adds what the client is told.
+    /// Takes records, and adds what the client is given.
     pub fn take(&mut self, records: &[TraceRecord], out: &mut String) {
         for record in records {
             if std::mem::take(&mut self.has_gap) && self.hears != Hears::Nothing {

@@ -42,7 +42,7 @@ const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
 const BEFORE_FRAMES: Duration = Duration::from_millis(100);
 /// A client that has not opened a bus by then is let go.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
-/// A client that takes nothing for so long is gone.
+/// A client that takes nothing for this long is gone.
 const PATIENCE: Duration = Duration::from_secs(30);
 /// Connections at a time, those that have not opened a bus among them.
 const MOST_CONNECTIONS: usize = 32;

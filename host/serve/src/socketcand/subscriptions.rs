@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use cantap_wire::{Frame, Id};
 
-/// Which frames of an identifier are told.
+/// Which frames of an identifier are passed on.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum Wanted {
     /// All.
@@ -58,7 +58,7 @@ impl Subscriptions {
         self.by_id.clear();
     }
 
-    /// Takes a frame. Returns it if it is told now.
+    /// Takes a frame. Returns it if it is passed on now.
     pub fn take(&mut self, time_ns: i64, frame: &Frame) -> Option<(i64, Frame)> {
         let subscription = self.by_id.get_mut(&frame.id())?;
         if frame.is_remote() {

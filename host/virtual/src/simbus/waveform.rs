@@ -30,7 +30,7 @@ pub struct Waveform {
 }
 
 impl Waveform {
-    /// Puts a frame on the bus that starts at `start_ns` and ends well, or with an error behind so many of its bits.
+    /// Puts a frame on the bus that starts at `start_ns` and ends well, or with an error behind this many of its bits.
     pub fn frame(
         &mut self,
         frame: &Frame,

@@ -162,7 +162,7 @@ impl Wire {
         std::mem::take(&mut self.history)
     }
 
-    /// Makes edges to recessive come later than they should by so many core cycles, as on a bus with much capacitance.
+    /// Makes edges to recessive come this many core cycles later than they should, as on a bus with much capacitance.
     pub fn slow_recessive(&mut self, cycles: u64) {
         self.waveform.slow_recessive = cycles;
     }

@@ -12,7 +12,7 @@ const TIME_COLUMNS: usize = 16;
 /// Rows between values.
 const VALUE_ROWS: usize = 3;
 
-/// The labels of values, each with its row, of a pane with so many rows.
+/// The labels of values, each with its row, of a pane with this many rows.
 pub fn values([low, high]: [f64; 2], rows: u16) -> Vec<(u16, String)> {
     if rows == 0 || high.total_cmp(&low).is_le() {
         return Vec::new();

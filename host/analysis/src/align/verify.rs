@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use hdrhistogram::Histogram;
 
 use super::Alignment;
-use crate::{TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{TraceEvent, TraceFrame, TraceRecord};
 
 /// The longest difference that is counted, in nanoseconds: beyond every tolerance.
 const MOST_NS: u64 = 1_000_000_000;

@@ -5,7 +5,7 @@
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::{BuildHasher, BuildHasherDefault, DefaultHasher};
 
-use crate::{TraceEvent, TraceRecord};
+use cantap_trace::{TraceEvent, TraceRecord};
 
 /// Runs that are kept of a trace: seven a second of ten hours at 5000 frames a second, in some 16 MiB.
 const MOST_RUNS: usize = 1 << 18;

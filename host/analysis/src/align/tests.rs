@@ -2,7 +2,7 @@ use cantap_wire::{Frame, Id};
 use proptest::prelude::*;
 
 use super::*;
-use crate::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// A frame of a bus with a few identifiers; `content` is what changes.
 fn record(time_ns: i64, channel: u8, id: u16, content: u64) -> TraceRecord {

@@ -42,6 +42,7 @@ mod meter;
 mod missing;
 mod monitor;
 mod progress;
+mod protocols;
 mod rescue;
 mod sending;
 mod shells;

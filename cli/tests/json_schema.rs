@@ -36,6 +36,8 @@ fn directory(test: &str) -> PathBuf {
                 (1.004000) can0 7E8#215A5A5A314B5A41\n(1.005000) can0 7E8#2257303030303031\n(2.000000) can0 7DF#02010CAAAAAAAAAA\n\
                 (2.001000) can0 7E8#04410C1AF8AAAAAA\n(3.000000) can0 7E0#021003AAAAAAAAAA\n";
     fs::write(directory.join("talk.log"), talk).unwrap();
+    let other = talk.replace("215A5A5A", "215B5A5A").replace("7DF", "7E1");
+    fs::write(directory.join("other.log"), other + "(4.000000) can0 7E9#04410C1AF8AAAAAA\n").unwrap();
     fs::write(directory.join("car.dbc"), database).unwrap();
     fs::write(directory.join("odd.dbc"), database.replace("8|8@1-", "8|99@1-")).unwrap();
     directory
@@ -51,7 +53,7 @@ fn cantap(directory: &Path, line: &str) -> (Option<i32>, String, String) {
 }
 
 /// A command line, without `--json`; its exit code; the type of its object, or of each of its lines but the last, and of the last.
-const LINES: [(&str, i32, &[&str]); 60] = [
+const LINES: [(&str, i32, &[&str]); 65] = [
     ("list", 0, &["list"]),
     ("info -d virtual", 0, &["info"]),
     ("status -d virtual --registers", 0, &["status"]),
@@ -107,6 +109,11 @@ const LINES: [(&str, i32, &[&str]); 60] = [
     ("canopen heartbeat -d virtual:load=0 -b 500k 5 --period 10ms -n 3", 0, &["conversations"]),
     ("j1939 claim -d virtual:load=0 -b 250k", 0, &["conversations"]),
     ("j1939 send -d virtual:load=0 -b 250k 0xFEEC 0102", 0, &["conversations"]),
+    ("stats talk.log --protocols", 0, &["stats"]),
+    ("decode talk.log --protocols", 0, &["decode", "decode_end"]),
+    ("decode talk.log --protocols --details", 0, &["decode", "decode_end"]),
+    ("search talk.log uds.did%==%0xF190", 0, &["search", "search_end"]),
+    ("diff talk.log other.log --protocols", 0, &["diff"]),
     ("diff a.log b.log", 0, &["diff"]),
     ("diff b.log a.log --ignore-channels", 0, &["diff"]),
     ("plot a.log --db car.dbc -o out.svg", 0, &["plot"]),

@@ -61,7 +61,7 @@ pub struct Args {
     /// A profile: device, bit rates, databases, filters, view, send list.
     #[arg(short, long, value_name = "FILE")]
     profile: Option<PathBuf>,
-    /// The page to begin with: trace, fixed, signals, graph, statistics, send or record.
+    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record or nodes.
     #[arg(long, value_name = "PAGE", value_parser = view)]
     view: Option<View>,
     /// Record to this file from the start.
@@ -92,7 +92,8 @@ pub struct Args {
 
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
-    found.ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send or record".to_owned())
+    found
+        .ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send, record or nodes".to_owned())
 }
 
 fn size(text: &str) -> Result<(u16, u16), String> {

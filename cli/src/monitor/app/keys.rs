@@ -52,7 +52,7 @@ impl App {
         match key.code {
             KeyCode::Char('q') => return Flow::Quit,
             KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
-            KeyCode::Char(digit @ '1'..='7') => self.show(View::ALL[digit as usize - '1' as usize]),
+            KeyCode::Char(digit @ '1'..='8') => self.show(View::ALL[digit as usize - '1' as usize]),
             KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
             KeyCode::BackTab => {
                 self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
@@ -266,7 +266,7 @@ impl App {
                     self.cursor = Some(place);
                 }
             }
-            View::Graph | View::Statistics | View::Record => {}
+            View::Graph | View::Statistics | View::Record | View::Nodes => {}
         }
     }
 }

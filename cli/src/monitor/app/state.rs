@@ -37,12 +37,22 @@ pub enum View {
     Send,
     /// Recording.
     Record,
+    /// Nodes, transfers, and what was said.
+    Nodes,
 }
 
 impl View {
     /// In the order of their keys.
-    pub const ALL: [View; 7] =
-        [View::Trace, View::Fixed, View::Signals, View::Graph, View::Statistics, View::Send, View::Record];
+    pub const ALL: [View; 8] = [
+        View::Trace,
+        View::Fixed,
+        View::Signals,
+        View::Graph,
+        View::Statistics,
+        View::Send,
+        View::Record,
+        View::Nodes,
+    ];
 
     /// What its tab says.
     pub const fn title(self) -> &'static str {
@@ -54,6 +64,7 @@ impl View {
             Self::Statistics => "Statistics",
             Self::Send => "Send",
             Self::Record => "Record",
+            Self::Nodes => "Nodes",
         }
     }
 

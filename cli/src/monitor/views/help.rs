@@ -10,7 +10,7 @@ use super::super::theme::Theme;
 
 /// Every key; `tests/help.rs` holds them to what the keys do.
 pub const KEYS: &[(&str, &str)] = &[
-    ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
+    ("1 … 8, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
     ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
     ("h ? F1", "this"),
     ("Space", "stop the display or the file, go on; send: entry on or off"),

@@ -25,7 +25,7 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashSet;
 
 use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// Requests that wait for a response at the same time.
 const MOST_WAITING: usize = 256;
@@ -310,5 +310,9 @@ impl Assembler for Diagnostics {
         while !self.waiting.is_empty() {
             self.give_up(0, Trouble::Unfinished, events);
         }
+    }
+
+    fn under_way(&self, out: &mut Vec<UnderWay>) {
+        self.transport.under_way(out);
     }
 }

@@ -22,6 +22,7 @@ mod metadata;
 mod outcome;
 mod package;
 mod peers;
+mod python;
 mod reproducible;
 mod size;
 mod soak;

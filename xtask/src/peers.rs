@@ -11,7 +11,7 @@ use crate::workspace;
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
 /// Python packages, with their versions.
-const REQUIREMENTS: &str = "xtask/peers.txt";
+pub const REQUIREMENTS: &str = "xtask/peers.txt";
 
 /// Where the peers are.
 pub struct Peers {

@@ -10,8 +10,8 @@ use crate::outcome::Outcome;
 use crate::peers::Peers;
 use crate::toolchain::Toolchain;
 use crate::{
-    check, compiler, cross, dependencies, features, firmware, kernel, package, reproducible, size, tests,
-    typos, workspace,
+    check, compiler, cross, dependencies, features, firmware, kernel, package, python, reproducible, size,
+    tests, typos, workspace,
 };
 
 /// What `cargo xtask test` takes.
@@ -59,6 +59,8 @@ enum Step {
     Reproducible,
     /// Every test, those that run the firmware's ELF on the emulated board included.
     Tests,
+    /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
+    Python,
     /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
     Kernel,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
@@ -126,6 +128,7 @@ impl Step {
             Step::ClippyFirmware => firmware::clippy(shell, toolchain)?,
             Step::Reproducible => reproducible::check(shell, toolchain)?,
             Step::Tests => tests::run(shell, peers)?,
+            Step::Python => return python::check(shell, peers),
             Step::Kernel => return kernel::run(shell),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,

@@ -33,8 +33,8 @@ struct State {
     end: Option<End>,
 }
 
-/// The buffer.
-pub(super) struct Buffer {
+/// The buffer: for whoever hands on records that came from a device too.
+pub struct Buffer {
     state: Mutex<State>,
     changed: Condvar,
     capacity: usize,
@@ -128,6 +128,12 @@ impl Buffer {
     /// Whether nothing follows.
     pub fn has_ended(&self) -> bool {
         self.lock().end.is_some()
+    }
+
+    /// Whether [`Self::pop`] would not wait.
+    pub fn is_ready(&self) -> bool {
+        let state = self.lock();
+        !state.batches.is_empty() || state.end.is_some()
     }
 
     /// The next records; none if there are none within `timeout`; `None` after the last. An error is

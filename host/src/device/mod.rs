@@ -30,6 +30,7 @@ use cantap_wire::message::{ChannelConfig, Filter, Mode, Status};
 use cantap_wire::record::LossStage;
 use cantap_wire::{BitTiming, CHANNELS, Channel, Command, Hello, PROTOCOL_VERSION, Refusal, Reply};
 
+pub use buffer::Buffer;
 pub use clock::{
     ClockMap, ClockReport, ClockSource, CommonClock, Follower, FollowerReport, FrameClock, FrameDoubt,
     FrameNs, NotCommon, SofMark, Ticks, UtcClock, UtcNs,

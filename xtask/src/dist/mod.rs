@@ -8,7 +8,7 @@ mod notices;
 
 use anyhow::Result;
 
-use crate::workspace;
+use crate::{python, workspace};
 
 /// What `cargo xtask dist` takes.
 #[derive(clap::Args)]
@@ -24,6 +24,8 @@ enum What {
     Command,
     /// The same as Debian's package, with the udev rule.
     Deb,
+    /// The package for Python: a wheel for this system, and the sources that it builds from.
+    Python,
     /// An archive for each board: ELF, and the image for `dfu-util`.
     Firmware,
 }
@@ -40,6 +42,11 @@ pub fn run(args: &Args) -> Result<()> {
             What::Command => command::pack(&shell, &dist)?,
             What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is no Linux"),
             What::Deb => deb::pack(&shell, &dist)?,
+            What::Python => {
+                let made = workspace::target().join("python/dist");
+                shell.copy_file(python::wheel(&shell, "release", &made.join("wheel"))?, &dist)?;
+                shell.copy_file(python::source_archive(&shell, &made.join("sources"))?, &dist)?;
+            }
             What::Firmware => firmware::pack(&shell, &dist)?,
         }
     }

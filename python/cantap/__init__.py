@@ -1,0 +1,50 @@
+"""CAN buses and traces: the cantap analyser, trace files of every common format, signals as Arrow tables.
+
+`open` begins a session with the analyser; `read` and `scan` take a trace of any format, with a database as decoded signals.
+"""
+
+from ._native import (
+    CantapError,
+    CantapWarning,
+    DatabaseError,
+    DeviceError,
+    FormatError,
+    Frame,
+    PeriodicFrame,
+    Record,
+    Records,
+    Reply,
+    Report,
+    Scan,
+    Table,
+    __version__,
+)
+from .device import Checksum, Counter, Device, RandomByte, boards, open
+from .traces import Database, load_database, read, scan
+
+__all__ = [
+    "CantapError",
+    "CantapWarning",
+    "Checksum",
+    "Counter",
+    "Database",
+    "DatabaseError",
+    "Device",
+    "DeviceError",
+    "FormatError",
+    "Frame",
+    "PeriodicFrame",
+    "RandomByte",
+    "Record",
+    "Records",
+    "Reply",
+    "Report",
+    "Scan",
+    "Table",
+    "__version__",
+    "boards",
+    "load_database",
+    "open",
+    "read",
+    "scan",
+]

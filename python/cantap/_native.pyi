@@ -1,0 +1,340 @@
+"""The compiled half. What is documented for users is in `cantap` itself."""
+
+import os
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, TypedDict, final
+
+__version__: str
+
+class CantapError(Exception):
+    """The base of all errors of this package."""
+
+class DeviceError(CantapError):
+    """A device could not be opened, refused a request, or is gone."""
+
+class FormatError(CantapError):
+    """A file is no trace of a format that is read or written."""
+
+class DatabaseError(CantapError):
+    """A signal database cannot be used, or does not fit."""
+
+class CantapWarning(UserWarning):
+    """Something was left out, and the rest can be used."""
+
+class Options(TypedDict):
+    path: str | os.PathLike[str]
+    db: Database | None
+    signals: list[str]
+    filters: list[str]
+    channels: list[int]
+    start: str | None
+    end: str | None
+    format: str | None
+    zone: str | None
+    strict: bool
+
+@final
+class Database:
+    """Databases, compiled: read once, used for any number of traces, devices and frames, in any thread."""
+
+    def __new__(cls, files: list[tuple[int | None, str | os.PathLike[str]]], j1939: bool) -> Database: ...
+    @staticmethod
+    def of_virtual_car() -> Database:
+        """The database of the virtual car (`virtual:car`)."""
+    @property
+    def warnings(self) -> list[str]:
+        """What is wrong with the files, and can be lived with."""
+    @property
+    def message_names(self) -> list[str]:
+        """The names of all messages."""
+    def signals_of(self, message: str) -> list[dict[str, str]]:
+        """The signals of a message: `name`, `unit` and `description` of each."""
+
+@final
+class Report:
+    """What was read of a file, and what could not be."""
+
+    @property
+    def file(self) -> str:
+        """The file's name, as it was given."""
+    @property
+    def format(self) -> str:
+        """The format that it was read as."""
+    @property
+    def records_read(self) -> int:
+        """Records that the file had, before any filter."""
+    @property
+    def records(self) -> int:
+        """Records that passed the filters."""
+    @property
+    def frames(self) -> int:
+        """Frames among them."""
+    @property
+    def lost(self) -> int:
+        """Frames that the trace says are missing in it."""
+    @property
+    def lost_at_least(self) -> bool:
+        """Whether there may be more missing than `lost`."""
+    @property
+    def bus_errors(self) -> int:
+        """Bus errors, with those that were only counted."""
+    @property
+    def decoded(self) -> int:
+        """Frames that a database had a message for."""
+    @property
+    def values(self) -> int:
+        """Values in them."""
+    @property
+    def issues(self) -> int:
+        """Places that could not be read."""
+    @property
+    def faults(self) -> list[str]:
+        """The first twenty of them, in words."""
+    @property
+    def is_cut(self) -> bool:
+        """Whether the file ends in the middle of something."""
+    @property
+    def left_out(self) -> dict[str, int]:
+        """What is well-formed and no part of a CAN trace, by kind."""
+    @property
+    def notes(self) -> dict[str, int]:
+        """What is nothing wrong and should be known all the same, by kind."""
+    @property
+    def missing_pct(self) -> float:
+        """The share of the file's entries that could not be read or are left out, in per cent."""
+    @property
+    def is_whole(self) -> bool:
+        """Whether the file was read to its end and every place of it could be read."""
+    def to_dict(self) -> dict[str, Any]:
+        """All of it."""
+
+@final
+class Table:
+    """A table in memory; any Arrow program takes it without copying."""
+
+    @property
+    def num_rows(self) -> int:
+        """How many rows there are."""
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """The columns' names, in order."""
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What is known about the table beside its columns."""
+    @property
+    def report(self) -> Report | None:
+        """What was read, and what could not be; `None` for a table that came from no file."""
+    def column_metadata(self, name: str) -> dict[str, str]:
+        """What is known about a column beside its values: its unit, its description."""
+    def batches(self) -> list[Table]:
+        """The table in the pieces that it has in memory."""
+    def __len__(self) -> int: ...
+    def __arrow_c_schema__(self) -> object: ...
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
+    def __arrow_c_array__(self, requested_schema: object | None = None) -> tuple[object, object]: ...
+
+@final
+class Scan(Iterator[Table]):
+    """A trace being read, batch by batch: memory does not grow with the file."""
+
+    def __new__(cls, options: Options, batch_rows: int) -> Scan: ...
+    @property
+    def report(self) -> Report:
+        """What was read so far, and what could not be."""
+    @property
+    def column_names(self) -> tuple[str, ...]:
+        """The columns' names, in order."""
+    def read_all(self) -> Table:
+        """All that is left, as one table."""
+    def close(self) -> None:
+        """Closes the file."""
+    def __iter__(self) -> Scan: ...
+    def __next__(self) -> Table: ...
+    def __enter__(self) -> Scan: ...
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None: ...
+    def __arrow_c_schema__(self) -> object: ...
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
+
+@final
+class Frame:
+    """A classical CAN frame."""
+
+    def __new__(
+        cls,
+        id: int,
+        data: bytes | bytearray | list[int] | None = None,
+        *,
+        extended: bool | None = None,
+        remote: bool = False,
+        dlc: int | None = None,
+    ) -> Frame: ...
+    @staticmethod
+    def parse(text: str) -> Frame:
+        """Reads a frame as can-utils write it: `123#1122`, `00000123#R3`."""
+    @property
+    def id(self) -> int:
+        """The identifier."""
+    @property
+    def extended(self) -> bool:
+        """Whether the identifier has 29 bits."""
+    @property
+    def remote(self) -> bool:
+        """Whether it asks for data and has none."""
+    @property
+    def dlc(self) -> int:
+        """The length code on the bus."""
+    @property
+    def data(self) -> bytes:
+        """The data bytes."""
+    def __hash__(self) -> int: ...
+    def __eq__(self, other: object) -> bool: ...
+
+@final
+class Record:
+    """What happened on a bus: a frame, an error, a loss."""
+
+    @property
+    def time_s(self) -> float:
+        """Seconds since 1970, UTC."""
+    @property
+    def time_ns(self) -> int:
+        """Nanoseconds since 1970, UTC. Of a frame it is the end."""
+    @property
+    def channel(self) -> int:
+        """The channel, from 1."""
+    @property
+    def event(self) -> str:
+        """What happened: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`."""
+    @property
+    def detail(self) -> str | None:
+        """Where frames were lost, which error, which state, why not sent."""
+    @property
+    def count(self) -> int | None:
+        """Frames lost, errors suppressed, periods that passed."""
+    @property
+    def at_least(self) -> bool:
+        """Whether more may have been lost."""
+    @property
+    def id(self) -> int | None:
+        """The frame's identifier."""
+    @property
+    def extended(self) -> bool:
+        """Whether it has 29 bits."""
+    @property
+    def remote(self) -> bool:
+        """Whether the frame asks for data and has none."""
+    @property
+    def dlc(self) -> int | None:
+        """The frame's length code on the bus."""
+    @property
+    def data(self) -> bytes | None:
+        """The frame's data bytes."""
+    @property
+    def direction(self) -> str | None:
+        """`rx` or `tx`, of a frame."""
+    @property
+    def late(self) -> bool:
+        """Whether the frame ended then or earlier."""
+    def __hash__(self) -> int: ...
+    def __eq__(self, other: object) -> bool: ...
+
+@final
+class Records(Iterator[Record]):
+    """The records of a device from the time on at which this was made."""
+
+    def __iter__(self) -> Records: ...
+    def __next__(self) -> Record: ...
+    def read(self, timeout: float | None = None) -> Record | None:
+        """The next record; `None` if there is none within `timeout` seconds, or after the last."""
+    def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
+        """Records of the next `seconds`, at most `rows`, as a table."""
+    @property
+    def lost(self) -> tuple[int, int]:
+        """Frames lost here because this program did not take them, of channel 1 and 2."""
+    def fileno(self) -> int:
+        """A file descriptor that is readable while a record waits."""
+    def close(self) -> None:
+        """Hears nothing more; what waits can still be read."""
+    def _message(
+        self, timeout: float | None
+    ) -> tuple[float, int, bool, bool, bool, int, bytes, bool, int] | None: ...
+    def _filter(self, filters: list[str], only_received: bool) -> None: ...
+
+@final
+class PeriodicFrame:
+    """A frame that the device sends again and again, until this is stopped or forgotten."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it goes on, as far as it was not given a count."""
+    def update(self, frame: Frame | str) -> None:
+        """Sends another frame from now on."""
+    def stop(self) -> None:
+        """Ends it."""
+
+@final
+class Reply:
+    """A frame that the device sends whenever it receives a matching one, until this is stopped or forgotten."""
+
+    @property
+    def is_running(self) -> bool:
+        """Whether it goes on, as far as it was not given a count."""
+    def stop(self) -> None:
+        """Ends it."""
+
+@final
+class Device:
+    def __new__(cls, address: str) -> Device: ...
+    @property
+    def address(self) -> str: ...
+    @property
+    def closed(self) -> bool: ...
+    @property
+    def is_virtual_car(self) -> bool: ...
+    def info(self) -> dict[str, Any]: ...
+    def open_channel(self, number: int, options: dict[str, Any]) -> tuple[int, str | None]: ...
+    def close_channel(self, number: int) -> None: ...
+    def open_channels(self) -> dict[int, dict[str, Any]]: ...
+    def records(
+        self,
+        channel_number: int | None = None,
+        filters: list[str] = ...,
+        only_received: bool = False,
+        capacity: int = ...,
+    ) -> Records: ...
+    def send(
+        self,
+        number: int,
+        frames: list[Frame | str] | list[Frame],
+        timeout: float | None,
+        at_ns: int | None = None,
+        queue_timeout: float = 1.0,
+    ) -> list[int]: ...
+    def abort(self, number: int) -> None: ...
+    def periodic(
+        self,
+        number: int,
+        frame: Frame | str,
+        period_s: float,
+        count: int,
+        modifiers: list[tuple[str, int, int, int, str]],
+    ) -> PeriodicFrame: ...
+    def reply(
+        self,
+        number: int,
+        to: tuple[int, int | None, bool | None],
+        frame: Frame | str,
+        count: int,
+    ) -> Reply: ...
+    def status(self) -> dict[str, Any]: ...
+    def losses(self) -> dict[int, dict[str, int]]: ...
+    def clock(self) -> dict[str, Any]: ...
+    def time_ns(self) -> int: ...
+    def recover(self, number: int) -> None: ...
+    def identify(self, seconds: int) -> None: ...
+    def close(self) -> None: ...
+
+def list_boards() -> list[tuple[str, str | None, str | None]]: ...

@@ -1,0 +1,343 @@
+"""The interface `cantap` of python-can: `can.Bus(interface="cantap", channel="/dev/ttyACM0:1", bitrate=500_000)`."""
+
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import can
+from can.broadcastmanager import (
+    CyclicSendTaskABC,
+    LimitedDurationCyclicSendTaskABC,
+    ModifiableCyclicTaskABC,
+    RestartableCyclicTaskABC,
+)
+
+from . import _native
+from ._native import DeviceError, PeriodicFrame
+from .device import CAPACITY, Device, Mode, boards
+
+ALL_ERRORS = "#1FFFFFFF"
+EXTENDED = 0x8000_0000
+QUEUE_TIMEOUT = 10.0
+"""How long a frame waits for room in the device's queue, in seconds, where no other time is given."""
+
+
+class _Session:
+    """A device that the Bus objects of its channels share."""
+
+    def __init__(self, address: str) -> None:
+        self.device = Device(address, capacity=0)
+        self.users: dict[int, int] = {}
+
+
+_sessions: dict[str, _Session] = {}
+_lock = threading.RLock()
+
+
+def _split(channel: str) -> tuple[str, int]:
+    """`/dev/ttyACM0:2` is channel 2 of that device; without a number it is channel 1."""
+    address, colon, number = channel.rpartition(":")
+    if colon and number in ("1", "2"):
+        return address, int(number)
+    return channel, 1
+
+
+class CantapBus(can.BusABC):
+    """A channel of a cantap analyser. Two channels of one are two Bus objects; they share its session.
+
+    :param channel: the device's address and the channel's number: `/dev/ttyACM0:1`, `virtual:2`, `tcp://bench:1`.
+    :param bitrate: in bit/s; without it the one saved on the device. `timing` in its place.
+    :param receive_own_messages: also those that this device sends on this channel.
+    :param listen_only: send nothing and acknowledge nothing. Also with `state=can.BusState.PASSIVE`.
+    :param one_shot: send each frame once.
+    :param manual_recovery: stay bus-off until :meth:`recover`.
+    :param rx_capacity: messages that wait; more are lost, counted, and an error frame says so.
+
+    Times are the device's stamps. Bus errors, changes of state and losses are error frames as SocketCAN has them.
+    """
+
+    def __init__(
+        self,
+        channel: str,
+        can_filters: Any = None,
+        *,
+        bitrate: int | None = None,
+        timing: can.BitTiming | can.BitTimingFd | None = None,
+        receive_own_messages: bool = False,
+        listen_only: bool = False,
+        state: can.BusState = can.BusState.ACTIVE,
+        one_shot: bool = False,
+        manual_recovery: bool = False,
+        rx_capacity: int = CAPACITY,
+        **kwargs: Any,
+    ) -> None:
+        if isinstance(timing, can.BitTimingFd) or kwargs.get("fd"):
+            raise can.CanInitializationError("the analyser has no CAN FD; open the channel without it")
+        self._address, self._number = _split(str(channel))
+        self._own = receive_own_messages
+        self._options: dict[str, Any] = {
+            "bitrate": int(bitrate) if bitrate is not None else None,
+            "sample_point": None,
+            "sjw": None,
+            "segments": None,
+            "one_shot": one_shot,
+            "manual_recovery": manual_recovery,
+        }
+        mode: Mode = "listen-only" if listen_only or state is can.BusState.PASSIVE else "normal"
+        self.channel_info = f"cantap {self._address} channel {self._number}"
+        self._can_protocol = can.CanProtocol.CAN_20
+        texts = _filter_texts(can_filters)
+        with _lock:
+            session = _sessions.get(self._address)
+            try:
+                if session is None or session.device.closed:
+                    session = _Session(self._address)
+                self._device = session.device
+                self._options["segments"] = self._segments(timing)
+                # Before the first frame can come.
+                self._records = self._device.records(
+                    self._number, filter=texts, only_received=not self._own, capacity=rx_capacity
+                )
+                if session.users.get(self._number, 0) == 0:
+                    self._open(mode, texts)
+                else:
+                    self._join(mode)
+            except BaseException as error:
+                if session is not None and not session.users:
+                    session.device.close()
+                if isinstance(error, (DeviceError, ValueError)):
+                    raise can.CanInitializationError(str(error)) from error
+                raise
+            session.users[self._number] = session.users.get(self._number, 0) + 1
+            _sessions[self._address] = session
+        self._session = session
+        super().__init__(channel=channel, can_filters=can_filters)
+
+    def _segments(self, timing: can.BitTiming | None) -> tuple[int, int, int, int] | None:
+        if timing is None:
+            return None
+        clock = self._device.info["can_clock_hz"]
+        if timing.f_clock != clock:
+            timing = timing.recreate_with_f_clock(clock)
+        return timing.brp, timing.tseg1, timing.tseg2, timing.sjw
+
+    def _open(self, mode: Mode, texts: list[str]) -> None:
+        self._device._native.open_channel(
+            self._number, {**self._options, "mode": mode, "filters": texts}
+        )
+
+    def _join(self, mode: Mode) -> None:
+        """Another Bus object has the channel open: that stays as it is."""
+        now = self._device.channels[self._number]
+        wanted = self._options["bitrate"]
+        if wanted not in (None, now["bitrate"]) or now["mode"] != mode:
+            raise can.CanInitializationError(
+                f"{self.channel_info} is open at {now['bitrate']} bit/s, {now['mode']}; open it as it is"
+            )
+
+    @property
+    def device(self) -> Device:
+        """The device, for what python-can has no words for: its clock, replies, timed sending."""
+        return self._device
+
+    # Receiving
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if self._is_shutdown:
+            raise can.CanOperationError(f"{self.channel_info} is shut down")
+        try:
+            found = self._records._message(timeout)
+        except DeviceError as error:
+            raise can.CanOperationError(str(error)) from error
+        if found is None:
+            return None, True
+        timestamp, identifier, extended, remote, is_error, dlc, data, is_rx, _ = found
+        message = can.Message(
+            timestamp, identifier, extended, remote, is_error, self._number - 1, dlc, data, False, is_rx
+        )
+        return message, True
+
+    def _apply_filters(self, filters: Any) -> None:
+        self._records._filter(_filter_texts(filters), not self._own)
+
+    def losses(self) -> dict[str, int]:
+        """Frames of this channel that were received and lost since the session began, by where; `bus`: by this object.
+
+        Where they are missing, :meth:`recv` gives an error frame with the class "controller problem" and the detail "RX buffer overflow",
+        whose bytes 2 to 5 are how many.
+        """
+        counts = dict(self._device.losses[self._number])
+        counts["bus"] = self._records.lost[self._number - 1]
+        counts["lost"] += counts["bus"]
+        return counts
+
+    def fileno(self) -> int:
+        """Readable while a message waits: for `asyncio` and `select`."""
+        return self._records.fileno()
+
+    # Sending
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        """Hands a message to the device; with `timeout` (seconds) waits until it was on the bus."""
+        frame = _frame(msg)
+        wait = timeout if timeout is not None and timeout > 0 else None
+        try:
+            self._device._native.send(self._number, [frame], wait, None, QUEUE_TIMEOUT)
+        except DeviceError as error:
+            raise can.CanOperationError(str(error)) from error
+
+    def flush_tx_buffer(self) -> None:
+        """Takes back what was not sent yet."""
+        self._device.abort(self._number)
+
+    def _send_periodic_internal(
+        self,
+        msgs: can.Message | Sequence[can.Message],
+        period: float,
+        duration: float | None = None,
+        autostart: bool = True,
+        modifier_callback: Callable[[can.Message], None] | None = None,
+    ) -> CyclicSendTaskABC:
+        messages = CyclicSendTaskABC._check_and_convert_messages(msgs)
+        if len(messages) == 1 and modifier_callback is None:
+            try:
+                return DeviceCyclicTask(self, messages, period, duration, autostart)
+            except (ValueError, DeviceError):
+                pass  # What the device cannot do, or has no room for, a thread of Python's does.
+        return super()._send_periodic_internal(msgs, period, duration, autostart, modifier_callback)
+
+    # State
+
+    @property
+    def state(self) -> can.BusState:
+        """ERROR: bus-off. PASSIVE: it only listens, or is error passive. ACTIVE otherwise."""
+        channel = self._device.status["channels"][self._number - 1]
+        if channel["state"] == "bus-off":
+            return can.BusState.ERROR
+        if channel["mode"] == "listen-only" or channel["state"] == "passive":
+            return can.BusState.PASSIVE
+        return can.BusState.ACTIVE
+
+    @state.setter
+    def state(self, new_state: can.BusState) -> None:
+        if new_state is can.BusState.ERROR:
+            raise ValueError("a bus is not put into the state ERROR; choose ACTIVE or PASSIVE")
+        mode: Mode = "listen-only" if new_state is can.BusState.PASSIVE else "normal"
+        self._device.close_channel(self._number)
+        self._open(mode, _filter_texts(self._filters))
+
+    def recover(self) -> None:
+        """Comes back from bus-off, where that is manual."""
+        self._device.recover(self._number)
+
+    def shutdown(self) -> None:
+        """Stops what is sent periodically, and closes the channel when no other Bus object uses it."""
+        if self._is_shutdown:
+            return
+        super().shutdown()
+        with _lock:
+            session = self._session
+            left = session.users[self._number] - 1
+            if left:
+                session.users[self._number] = left
+            else:
+                del session.users[self._number]
+            self._records.close()
+            try:
+                if not session.users:
+                    session.device.close()
+                elif not left:
+                    session.device.close_channel(self._number)
+            except DeviceError as error:
+                raise can.CanOperationError(str(error)) from error
+            finally:
+                if not session.users and _sessions.get(self._address) is session:
+                    del _sessions[self._address]
+
+    @staticmethod
+    def _detect_available_configs() -> list[Any]:
+        return [
+            {"interface": "cantap", "channel": f"{board['port']}:{number}"}
+            for board in boards()
+            for number in (1, 2)
+        ]
+
+
+class DeviceCyclicTask(
+    LimitedDurationCyclicSendTaskABC, ModifiableCyclicTaskABC, RestartableCyclicTaskABC
+):
+    """A message that the device sends by its own timer."""
+
+    def __init__(
+        self,
+        bus: CantapBus,
+        messages: Sequence[can.Message],
+        period: float,
+        duration: float | None,
+        autostart: bool,
+    ) -> None:
+        super().__init__(messages, period, duration)
+        self._bus = bus
+        self._task: PeriodicFrame | None = None
+        _frame(self.messages[0])
+        if autostart:
+            self.start()
+
+    def start(self) -> None:
+        """Begins, or begins anew."""
+        # Not `stop`, which the bus has wrapped so that it forgets the task.
+        self._end()
+        count = 0 if self.duration is None else max(1, math.ceil(self.duration / self.period))
+        self._task = self._bus.device.send_periodic(
+            self._bus._number, _frame(self.messages[0]), self.period, count=count
+        )
+
+    def stop(self) -> None:
+        """Ends it; :meth:`start` begins it anew."""
+        self._end()
+
+    def _end(self) -> None:
+        if self._task is not None:
+            self._task.stop()
+            self._task = None
+
+    def modify_data(self, messages: can.Message | Sequence[can.Message]) -> None:
+        """Sends other data from now on."""
+        super().modify_data(messages)
+        if self._task is not None:
+            self._task.update(_frame(self.messages[0]))
+
+
+def _frame(msg: can.Message) -> _native.Frame:
+    if msg.is_error_frame:
+        raise can.CanOperationError("an error frame cannot be sent")
+    if msg.is_fd:
+        raise can.CanOperationError("the analyser has no CAN FD; send a frame of up to 8 bytes")
+    try:
+        if msg.is_remote_frame:
+            return _native.Frame(msg.arbitration_id, extended=msg.is_extended_id, remote=True, dlc=msg.dlc)
+        return _native.Frame(msg.arbitration_id, bytes(msg.data), extended=msg.is_extended_id)
+    except (ValueError, OverflowError) as error:
+        raise can.CanOperationError(str(error)) from error
+
+
+def _filter_texts(filters: Any) -> list[str]:
+    """python-can's filters in candump's syntax. Error frames pass, as they do with SocketCAN."""
+    if not filters:
+        return []
+    elements = []
+    for one in filters:
+        identifier, mask = one["can_id"] & 0x1FFF_FFFF, one["can_mask"] & 0x1FFF_FFFF
+        extended = one.get("extended")
+        flag = 0 if extended is None else EXTENDED
+        if extended or (extended is None and identifier > 0x7FF):
+            elements.append(f"{identifier:08X}:{mask | flag:X}")
+        elif identifier & mask <= 0x7FF:
+            elements.append(f"{identifier & 0x7FF:03X}:{mask | flag:X}")
+        # No standard identifier is that large.
+    # Nothing matches both, where nothing is wanted.
+    none = [] if elements else ["000:0", "000~0", "j"]
+    return [",".join(["any", *elements, *none, ALL_ERRORS])]

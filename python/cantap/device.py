@@ -1,0 +1,312 @@
+"""The analyser, live."""
+
+from __future__ import annotations
+
+import atexit
+import datetime
+import weakref
+from collections.abc import Iterable, Iterator
+from types import TracebackType
+from typing import Any, Literal, TypeAlias
+
+from . import _native
+from ._native import Frame, PeriodicFrame, Record, Records, Reply, Table
+
+Mode: TypeAlias = Literal["listen-only", "normal", "loopback", "silent-loopback"]
+AnyFrame: TypeAlias = "Frame | str"
+ChecksumName: TypeAlias = Literal["xor", "sum", "crc8-j1850"]
+
+CAPACITY = 1 << 20
+"""Records that wait for a program that is busy: half a minute of two saturated channels."""
+
+_open: weakref.WeakSet[Device] = weakref.WeakSet()
+
+
+class Counter:
+    """Counts up in `bits` bits of byte `byte` (from 0), from bit `low_bit` up, before each transmission."""
+
+    def __init__(self, byte: int, low_bit: int = 0, bits: int = 8) -> None:
+        self.words = ("counter", byte, low_bit, bits, "")
+
+
+class Checksum:
+    """Puts a checksum over all other data bytes into byte `byte` (from 0) before each transmission."""
+
+    def __init__(self, byte: int, algorithm: ChecksumName = "crc8-j1850") -> None:
+        self.words = ("checksum", byte, 0, 0, algorithm)
+
+
+class RandomByte:
+    """Puts a new random value into byte `byte` (from 0) before each transmission."""
+
+    def __init__(self, byte: int) -> None:
+        self.words = ("random", byte, 0, 0, "")
+
+
+class Device:
+    """A device in a session of this program. `open` makes one.
+
+    Nothing is sent and nothing acknowledged until a channel is opened in another mode than `listen-only`. When the session ends,
+    however it does, the channels close and what the device sends by itself stops.
+    """
+
+    def __init__(self, address: str, *, capacity: int = CAPACITY) -> None:
+        self._native = _native.Device(address)
+        self._records = self._native.records(capacity=capacity)
+        _open.add(self)
+
+    @property
+    def address(self) -> str:
+        """Its address, as it was opened."""
+        return self._native.address
+
+    @property
+    def closed(self) -> bool:
+        """Whether it is closed."""
+        return self._native.closed
+
+    @property
+    def info(self) -> dict[str, Any]:
+        """What it is: board, serial number, versions, clocks, sizes of its tables."""
+        return self._native.info()
+
+    # Channels
+
+    def open_channel(
+        self,
+        channel: int,
+        bitrate: int | None = None,
+        *,
+        mode: Mode = "listen-only",
+        sample_point: float | None = None,
+        sjw: int | None = None,
+        segments: tuple[int, int, int, int] | None = None,
+        one_shot: bool = False,
+        manual_recovery: bool = False,
+        filter: str | Iterable[str] = (),
+    ) -> int:
+        """Opens a channel, 1 or 2, and returns its bit rate in bit/s.
+
+        Without a bit rate it is the one saved on the device; the virtual device's buses have 500 kbit/s.
+        `sample_point` in per cent; `segments`: prescaler, segment 1, segment 2 and jump width in place of a bit rate.
+        `filter` as with `cantap.read`: the device drops the rest in hardware, as far as it can, and this computer does what is left.
+        """
+        rate, _ = self._native.open_channel(
+            channel,
+            {
+                "bitrate": bitrate,
+                "mode": mode,
+                "sample_point": sample_point,
+                "sjw": sjw,
+                "segments": segments,
+                "one_shot": one_shot,
+                "manual_recovery": manual_recovery,
+                "filters": [filter] if isinstance(filter, str) else list(filter),
+            },
+        )
+        return rate
+
+    def close_channel(self, channel: int) -> None:
+        """Closes a channel, after everything it captured has come."""
+        self._native.close_channel(channel)
+
+    @property
+    def channels(self) -> dict[int, dict[str, Any]]:
+        """The open channels, each with `bitrate` and `mode`."""
+        return self._native.open_channels()
+
+    def recover(self, channel: int) -> None:
+        """Brings a channel back from bus-off that was opened with `manual_recovery`."""
+        self._native.recover(channel)
+
+    # Listening
+
+    def __iter__(self) -> Iterator[Record]:
+        """Records as they come: frames, errors, states, losses. Ends when the device is closed."""
+        return self._records
+
+    def read(self, timeout: float | None = None) -> Record | None:
+        """The next record; `None` if there is none within `timeout` seconds, or after the last."""
+        return self._records.read(timeout)
+
+    def batch(self, seconds: float | None = None, rows: int = 65_536) -> Table:
+        """Records of the next `seconds`, at most `rows`, as a table."""
+        return self._records.batch(seconds, rows)
+
+    def batches(self, seconds: float = 0.1, rows: int = 65_536) -> Iterator[Table]:
+        """Tables of what came in the last `seconds` or so, one after the other, until the device is closed. None is empty."""
+        while not self.closed:
+            table = self._records.batch(seconds, rows)
+            if len(table):
+                yield table
+
+    def records(
+        self,
+        channel: int | None = None,
+        *,
+        filter: str | Iterable[str] = (),
+        only_received: bool = False,
+        capacity: int = CAPACITY,
+    ) -> Records:
+        """Another stream of records, from now on: of one channel, of some frames, without those that this device sends.
+
+        Who does not take them loses frames when `capacity` records wait: they are counted, and a loss stands in their place.
+        """
+        filters = [filter] if isinstance(filter, str) else list(filter)
+        return self._native.records(channel, filters, only_received, capacity)
+
+    # Sending
+
+    def send(
+        self,
+        channel: int,
+        frames: AnyFrame | Iterable[AnyFrame],
+        *,
+        timeout: float | None = 1.0,
+        at: float | datetime.datetime | None = None,
+    ) -> list[float]:
+        """Sends a frame or several, in order, and returns when each was on the bus, in seconds since 1970.
+
+        What is not sent within `timeout` seconds is taken back, with everything else that the channel still had to send, and is a
+        `DeviceError`. With `timeout=None` the frames are only handed to the device.
+        `at`: not before this time, in seconds since 1970 or a date with a time zone; the device keeps it, the times of the
+        frames counting into `timeout`.
+        """
+        all_frames = [frames] if isinstance(frames, (Frame, str)) else list(frames)
+        at_ns = None
+        if isinstance(at, datetime.datetime):
+            if at.tzinfo is None:
+                raise ValueError(f"{at} has no time zone; give it one")
+            at_ns = int(at.timestamp() * 1e9)
+        elif at is not None:
+            at_ns = int(at * 1e9)
+        return [time_ns / 1e9 for time_ns in self._native.send(channel, all_frames, timeout, at_ns)]
+
+    def abort(self, channel: int) -> None:
+        """Takes back what a channel still has to send."""
+        self._native.abort(channel)
+
+    def send_periodic(
+        self,
+        channel: int,
+        frame: AnyFrame,
+        period: float,
+        *,
+        count: int = 0,
+        modifiers: Iterable[Counter | Checksum | RandomByte] = (),
+    ) -> PeriodicFrame:
+        """Has the device send a frame every `period` seconds by its own timer, `count` times or for ever, until it is stopped.
+
+        `modifiers` change its data before each transmission, in their order: `[Counter(0, bits=4), Checksum(7)]`.
+        """
+        words = [modifier.words for modifier in modifiers]
+        return self._native.periodic(channel, frame, period, count, words)
+
+    def reply(
+        self,
+        channel: int,
+        id: int,
+        frame: AnyFrame,
+        *,
+        mask: int | None = None,
+        extended: bool | None = None,
+        count: int = 0,
+    ) -> Reply:
+        """Has the device send a frame whenever it receives one with this identifier, within microseconds, until it is stopped."""
+        return self._native.reply(channel, (id, mask, extended), frame, count)
+
+    # State
+
+    @property
+    def status(self) -> dict[str, Any]:
+        """How the device and its channels are: states, error counters, queues."""
+        return self._native.status()
+
+    @property
+    def losses(self) -> dict[int, dict[str, int]]:
+        """Frames received and lost since the session began, by channel: at the controller, in the queue, on the link, here.
+
+        `host` is what this session's own reader lost; what a stream of records lost is in `Records.lost`.
+        """
+        return self._native.losses()
+
+    @property
+    def clock(self) -> dict[str, Any]:
+        """What is known about the device's clock: `drift_ppm`, `uncertainty_ns`, what it is measured with."""
+        return self._native.clock()
+
+    def time(self) -> float:
+        """The device's time, in seconds since 1970."""
+        return self._native.time_ns() / 1e9
+
+    def identify(self, seconds: int = 5) -> None:
+        """Shows an LED pattern, to find the board among others."""
+        self._native.identify(seconds)
+
+    def close(self) -> None:
+        """Closes the channels and ends the session. Records that came can still be read."""
+        self._native.close()
+        _open.discard(self)
+
+    def __enter__(self) -> Device:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def __repr__(self) -> str:
+        return "<cantap.Device, closed>" if self.closed else f"<cantap.Device at {self.address}>"
+
+    def __reduce__(self) -> Any:
+        raise TypeError("a device cannot be pickled; open it where it is used")
+
+
+@atexit.register
+def _close_all() -> None:
+    """A program that ends leaves its buses in order."""
+    for device in list(_open):
+        try:
+            device.close()
+        except _native.CantapError:
+            pass  # It is gone, or another process's.
+
+
+def open(
+    address: str,
+    bitrate: int | None = None,
+    *,
+    channels: Iterable[int] = (1, 2),
+    mode: Mode = "listen-only",
+    filter: str | Iterable[str] = (),
+    capacity: int = CAPACITY,
+) -> Device:
+    """Begins a session with the device at an address, as the command takes it after `-d`.
+
+    `/dev/ttyACM0`, `COM5`, `virtual`, `virtual:car`, `unix:`, `tcp://HOST`, `tls://HOST`, `ssh://[USER@]HOST`.
+
+    With a bit rate, the `channels` are opened; without one, none is: `Device.open_channel` does that one by one.
+
+        with cantap.open("/dev/ttyACM0", 500_000) as device:
+            for record in device:
+                print(record)
+    """
+    device = Device(address, capacity=capacity)
+    if bitrate is not None:
+        filters = [filter] if isinstance(filter, str) else list(filter)
+        try:
+            for channel in channels:
+                device.open_channel(channel, bitrate, mode=mode, filter=filters)
+        except BaseException:
+            device.close()
+            raise
+    return device
+
+
+def boards() -> list[dict[str, str | None]]:
+    """The boards that are connected to this computer: `port`, `serial`, `product`."""
+    return [
+        {"port": port, "serial": serial, "product": product}
+        for port, serial, product in _native.list_boards()
+    ]

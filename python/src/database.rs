@@ -1,0 +1,119 @@
+//! Signal databases.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use cantap_signals::{Decoder, Selection, Source};
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+
+use crate::error::Error;
+
+/// Databases, compiled: read once, used for any number of traces, devices and frames, in any thread.
+#[pyclass(module = "cantap", frozen)]
+pub struct Database {
+    pub decoder: Arc<Decoder>,
+    /// The files, for pickles.
+    files: Vec<(Option<u8>, PathBuf)>,
+    is_j1939: bool,
+    warnings: Vec<String>,
+}
+
+impl Database {
+    /// What decodes these signals only; all without patterns.
+    pub fn selecting(&self, patterns: &[String]) -> Result<Arc<Decoder>, Error> {
+        if patterns.is_empty() {
+            return Ok(Arc::clone(&self.decoder));
+        }
+        let mut decoder = (*self.decoder).clone();
+        decoder.select(&Selection::new(patterns)?)?;
+        Ok(Arc::new(decoder))
+    }
+}
+
+#[pymethods]
+impl Database {
+    #[new]
+    fn new(files: Vec<(Option<u8>, PathBuf)>, j1939: bool) -> PyResult<Self> {
+        let mut sources = Vec::new();
+        let mut warnings = Vec::new();
+        for (channel, path) in &files {
+            if *channel == Some(0) {
+                return Err(Error::argument("channels count from 1").into());
+            }
+            let database = cantap_signals::load(path).map_err(Error::from)?;
+            warnings.extend(database.warnings.iter().map(|fault| format!("{}: {fault}", database.file)));
+            sources.push(Source { channel: *channel, database });
+        }
+        let mut decoder = Decoder::new(sources);
+        if j1939 {
+            decoder.assume_j1939();
+        }
+        for replaced in decoder.overrides() {
+            let (file, by, count) = (&replaced.file, &replaced.by, replaced.messages.len());
+            warnings.push(format!(
+                "{by} replaces {count} of {file}'s messages, such as {}",
+                replaced.messages[0]
+            ));
+        }
+        Ok(Self { decoder: Arc::new(decoder), files, is_j1939: j1939, warnings })
+    }
+
+    /// The database of the virtual car.
+    #[staticmethod]
+    fn of_virtual_car() -> PyResult<Self> {
+        let database = cantap_virtual::car::database().map_err(Error::from)?;
+        let decoder = Decoder::new(vec![Source { channel: None, database }]);
+        Ok(Self { decoder: Arc::new(decoder), files: Vec::new(), is_j1939: false, warnings: Vec::new() })
+    }
+
+    /// What is wrong with the files, and can be lived with.
+    #[getter]
+    fn warnings(&self) -> Vec<String> {
+        self.warnings.clone()
+    }
+
+    /// The names of all messages.
+    #[getter]
+    fn message_names(&self) -> Vec<String> {
+        self.decoder.messages().map(|(_, _, message)| message.name.clone()).collect()
+    }
+
+    /// The signals of a message: name, unit and description of each.
+    fn signals_of<'py>(&self, py: Python<'py>, message: &str) -> PyResult<Vec<Bound<'py, PyDict>>> {
+        let found = self.decoder.messages().find(|(_, _, known)| known.name == message);
+        let Some((_, _, found)) = found else {
+            return Err(Error::Database(format!("the database has no message '{message}'")).into());
+        };
+        found
+            .signals
+            .iter()
+            .map(|signal| {
+                let about = PyDict::new(py);
+                about.set_item("name", signal.label())?;
+                about.set_item("unit", &signal.unit)?;
+                about.set_item("description", &signal.description)?;
+                Ok(about)
+            })
+            .collect()
+    }
+
+    fn __repr__(&self) -> String {
+        let files: Vec<_> = self.files.iter().map(|(_, path)| path.display().to_string()).collect();
+        format!("<cantap.Database of {}: {} messages>", files.join(", "), self.decoder.messages().count())
+    }
+
+    #[expect(clippy::type_complexity, reason = "what pickle wants")]
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (Vec<(Option<u8>, PathBuf)>, bool))> {
+        if self.files.is_empty() {
+            let make = py.get_type::<Self>().getattr("_of_virtual_car")?.unbind();
+            return Ok((make, (Vec::new(), false)));
+        }
+        Ok((py.get_type::<Self>().into_any().unbind(), (self.files.clone(), self.is_j1939)))
+    }
+
+    #[staticmethod]
+    fn _of_virtual_car(_files: Vec<(Option<u8>, PathBuf)>, _j1939: bool) -> PyResult<Self> {
+        Self::of_virtual_car()
+    }
+}

@@ -1,0 +1,263 @@
+//! One device's records, for several who listen.
+//!
+//! A thread without Python takes them from the device and gives each listener its own. Who does not keep up loses records: they are
+//! counted, and a loss stands in their place.
+
+use std::collections::HashMap;
+use std::io::{self, PipeReader, PipeWriter, Read, Write};
+use std::sync::mpsc::{Receiver, SyncSender};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, Weak};
+use std::time::Duration;
+
+use cantap::device::{Buffer, Records, Transmission};
+use cantap::wire::{CHANNELS, Channel};
+use cantap::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::filter::Filter;
+
+/// How often to check whether to go on.
+pub const LOOK_EVERY: Duration = Duration::from_millis(100);
+
+/// What a listener wants to hear.
+#[derive(Clone, Debug, Default)]
+pub struct Wanted {
+    /// This channel only, from 1.
+    pub channel: Option<u8>,
+    /// These frames only; any of several.
+    pub filters: Vec<Filter>,
+    /// Not the frames that this device sends.
+    pub only_received: bool,
+}
+
+impl Wanted {
+    fn accepts(&self, record: &TraceRecord) -> bool {
+        let is_sent = matches!(record.event, TraceEvent::Frame { direction: Direction::Tx, .. });
+        (self.channel.is_none() || self.channel == Some(record.channel))
+            && !(self.only_received && is_sent)
+            && passes(&self.filters, record)
+    }
+}
+
+/// Whether one of the filters accepts a record; without filters all do.
+fn passes(filters: &[Filter], record: &TraceRecord) -> bool {
+    filters.is_empty() || filters.iter().any(|filter| filter.accepts(record))
+}
+
+pub fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Somebody who listens.
+pub struct Listener {
+    buffer: Buffer,
+    wanted: Mutex<Wanted>,
+    /// Readable while something waits, once somebody asked for it.
+    signal: Mutex<Option<Signal>>,
+    lost: Mutex<[u64; CHANNELS]>,
+    failure: Mutex<Option<String>>,
+}
+
+/// A pipe with at most one byte in it.
+struct Signal {
+    reader: PipeReader,
+    writer: PipeWriter,
+    is_set: bool,
+}
+
+impl Signal {
+    fn set(&mut self) {
+        if !self.is_set {
+            // One byte always fits.
+            self.is_set = self.writer.write_all(&[1]).is_ok();
+        }
+    }
+
+    fn clear(&mut self) {
+        if self.is_set {
+            self.is_set = self.reader.read_exact(&mut [0]).is_err();
+        }
+    }
+}
+
+impl Listener {
+    fn new(wanted: Wanted, capacity: usize) -> Self {
+        Self {
+            buffer: Buffer::new(capacity),
+            wanted: Mutex::new(wanted),
+            signal: Mutex::new(None),
+            lost: Mutex::new([0; CHANNELS]),
+            failure: Mutex::new(None),
+        }
+    }
+
+    fn push(&self, batch: &[TraceRecord]) {
+        let wanted = lock(&self.wanted);
+        let mut chosen: Vec<TraceRecord> =
+            batch.iter().filter(|record| wanted.accepts(record)).copied().collect();
+        drop(wanted);
+        if chosen.is_empty() {
+            return;
+        }
+        let lost = self.buffer.push(&mut chosen);
+        for (sum, lost) in lock(&self.lost).iter_mut().zip(lost) {
+            *sum += u64::from(lost);
+        }
+        self.wake();
+    }
+
+    fn wake(&self) {
+        if let Some(signal) = lock(&self.signal).as_mut() {
+            signal.set();
+        }
+    }
+
+    /// Nothing follows, for this reason if there is one.
+    pub fn end(&self, failure: Option<String>) {
+        *lock(&self.failure) = failure;
+        self.buffer.finish();
+        self.wake();
+    }
+
+    /// The next records, none if there are none within this time; `None` after the last.
+    pub fn pop(&self, timeout: Duration) -> Option<Vec<TraceRecord>> {
+        // A listener's buffer ends without an error; its reason is kept apart, so that each listener has it.
+        self.buffer.pop(Some(timeout)).unwrap_or(None)
+    }
+
+    /// Why nothing follows, if it is not that it was asked for. Told once.
+    pub fn failure(&self) -> Option<String> {
+        lock(&self.failure).take()
+    }
+
+    /// To be called when everything that was popped is used up: from then on the pipe says whether there is more.
+    pub fn used_up(&self) {
+        if let Some(signal) = lock(&self.signal).as_mut() {
+            signal.clear();
+            if self.buffer.is_ready() {
+                signal.set();
+            }
+        }
+    }
+
+    /// A pipe that is readable while something waits: here, or with whoever has popped it.
+    pub fn signal(&self, is_waiting: bool) -> io::Result<&Self> {
+        let mut signal = lock(&self.signal);
+        if signal.is_none() {
+            let (reader, writer) = io::pipe()?;
+            let mut made = Signal { reader, writer, is_set: false };
+            if is_waiting || self.buffer.is_ready() {
+                made.set();
+            }
+            *signal = Some(made);
+        }
+        Ok(self)
+    }
+
+    /// Its file descriptor.
+    #[cfg(unix)]
+    pub fn descriptor(&self) -> Option<i32> {
+        use std::os::fd::AsRawFd;
+        lock(&self.signal).as_ref().map(|signal| signal.reader.as_raw_fd())
+    }
+
+    /// Changes what is heard from now on.
+    pub fn want(&self, change: impl FnOnce(&mut Wanted)) {
+        change(&mut lock(&self.wanted));
+    }
+
+    /// Frames lost here because nobody took them, per channel.
+    pub fn lost(&self) -> [u64; CHANNELS] {
+        *lock(&self.lost)
+    }
+}
+
+/// Who listens to a device, and who waits for what it sends.
+#[derive(Default)]
+pub struct Fanout {
+    listeners: Mutex<Listeners>,
+    /// By tag.
+    waiting: Mutex<HashMap<u32, SyncSender<Transmission>>>,
+    /// What a channel was opened for; its hardware may pass more.
+    filters: Mutex<[Vec<Filter>; CHANNELS]>,
+}
+
+#[derive(Default)]
+struct Listeners {
+    all: Vec<Weak<Listener>>,
+    /// Nothing follows, for this reason if there is one.
+    ended: Option<Option<String>>,
+}
+
+impl Fanout {
+    /// Hears from now on.
+    pub fn listen(&self, wanted: Wanted, capacity: usize) -> Arc<Listener> {
+        let listener = Arc::new(Listener::new(wanted, capacity));
+        let mut listeners = lock(&self.listeners);
+        match &listeners.ended {
+            Some(failure) => listener.end(failure.clone()),
+            None => listeners.all.push(Arc::downgrade(&listener)),
+        }
+        listener
+    }
+
+    /// Lets only these pass from a channel from now on.
+    pub fn set_filters(&self, channel: Channel, filters: Vec<Filter>) {
+        lock(&self.filters)[channel.index()] = filters;
+    }
+
+    /// Hands out a device's records until they end. For a thread of its own.
+    pub fn pump(&self, mut records: Records) {
+        let failure = loop {
+            match records.next_batch(LOOK_EVERY) {
+                Ok(Some(mut batch)) => {
+                    let filters = lock(&self.filters).clone();
+                    if filters.iter().any(|filters| !filters.is_empty()) {
+                        batch.retain(|record| {
+                            let filters = filters.get(usize::from(record.channel).wrapping_sub(1));
+                            filters.is_none_or(|filters| passes(filters, record))
+                        });
+                    }
+                    lock(&self.listeners).all.retain(|listener| {
+                        listener.upgrade().inspect(|listener| listener.push(&batch)).is_some()
+                    });
+                    records.recycle(batch);
+                }
+                Ok(None) => break None,
+                Err(error) => break Some(error.to_string()),
+            }
+        };
+        self.end(failure);
+    }
+
+    fn end(&self, failure: Option<String>) {
+        let mut listeners = lock(&self.listeners);
+        for listener in listeners.all.drain(..).filter_map(|listener| listener.upgrade()) {
+            listener.end(failure.clone());
+        }
+        listeners.ended = Some(failure);
+    }
+
+    /// Tells how transmissions end, until no more do. For a thread of its own.
+    pub fn report(&self, ends: &Receiver<Transmission>) {
+        while let Ok(end) = ends.recv() {
+            if let Some(waiting) = lock(&self.waiting).remove(&end.tag) {
+                // Who does not wait any more has not to be told.
+                let _ = waiting.try_send(end);
+            }
+        }
+        // Whoever waits learns that nothing comes.
+        lock(&self.waiting).clear();
+    }
+
+    /// Has the end of a transmission told to somebody.
+    pub fn wait_for(&self, tag: u32, told: SyncSender<Transmission>) {
+        lock(&self.waiting).insert(tag, told);
+    }
+
+    /// Nobody waits for these any more.
+    pub fn forget(&self, tags: &[u32]) {
+        let mut waiting = lock(&self.waiting);
+        for tag in tags {
+            waiting.remove(tag);
+        }
+    }
+}

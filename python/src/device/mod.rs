@@ -1,0 +1,434 @@
+//! A device, for Python. Every call that waits lets other threads of Python run, and Ctrl-C through.
+
+mod fanout;
+mod records;
+mod session;
+mod tasks;
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use cantap::bit_timing::TimingRequest;
+use cantap::device::{ClockSource, Transmission};
+use cantap::wire::message::capability;
+use cantap::wire::message::{ChannelConfig, Mode};
+use cantap::wire::{BitTiming, Channel};
+use cantap::{DeviceError as DeviceFault, Frame as ClassicFrame};
+use cantap_trace::filter::Filter;
+use cantap_trace::names::{BUS_ERRORS, ERROR_STATES, name};
+use pyo3::exceptions::PyValueError;
+use pyo3::prelude::*;
+use pyo3::types::PyDict;
+use serde_json::json;
+
+use self::fanout::{Wanted, lock};
+use self::records::{Records, SLICE};
+use self::session::Session;
+use self::tasks::{PeriodicFrame, Reply};
+use crate::error::{DeviceError, Error};
+use crate::frame::{AnyFrame, failure};
+use crate::report::from_json;
+
+/// Modes by name.
+const MODES: [(Mode, &str); 4] = [
+    (Mode::ListenOnly, "listen-only"),
+    (Mode::Normal, "normal"),
+    (Mode::Loopback, "loopback"),
+    (Mode::SilentLoopback, "silent-loopback"),
+];
+/// A frame that has not ended after this time will not by itself.
+const MOST_TIME: Duration = Duration::from_secs(24 * 3600);
+
+/// A device in a session of this program.
+#[pyclass(module = "cantap", frozen, weakref)]
+pub struct Device {
+    session: Mutex<Option<Arc<Session>>>,
+}
+
+/// How a channel is to be opened, as Python's half hands it over.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct ChannelOptions {
+    bitrate: Option<u32>,
+    mode: String,
+    sample_point: Option<f64>,
+    sjw: Option<u8>,
+    /// Prescaler, segment 1, segment 2, jump width.
+    segments: Option<(u16, u8, u8, u8)>,
+    one_shot: bool,
+    manual_recovery: bool,
+    filters: Vec<String>,
+}
+
+/// A channel by its number.
+pub fn channel(number: u8) -> Result<Channel, Error> {
+    Channel::ALL
+        .into_iter()
+        .find(|channel| channel.number() == number)
+        .ok_or_else(|| Error::argument(format!("there is no channel {number}; a device has 1 and 2")))
+}
+
+/// Lets Python's signals through.
+pub fn signals() -> Result<(), Error> {
+    Python::attach(|py| py.check_signals()).map_err(Error::Python)
+}
+
+/// A frame that was not sent.
+fn not_sent(end: &Transmission, frame: &ClassicFrame) -> Error {
+    let reason = end.result.err().map_or("", failure);
+    Error::Address(format!("{frame} was not sent on channel {}: {reason}", end.channel.number()))
+}
+
+impl Device {
+    fn session(&self) -> Result<Arc<Session>, Error> {
+        let session = lock(&self.session).clone();
+        let session =
+            session.ok_or_else(|| Error::Address("the device is closed; open it again".to_owned()))?;
+        session.device()?;
+        Ok(session)
+    }
+
+    /// Asks the device, while Python goes on.
+    fn ask<T: Send>(
+        &self,
+        py: Python<'_>,
+        question: impl FnOnce(&cantap::Device) -> Result<T, DeviceFault> + Send,
+    ) -> PyResult<T> {
+        let session = self.session()?;
+        Ok(py.detach(|| question(session.device()?).map_err(Error::from))?)
+    }
+}
+
+#[pymethods]
+impl Device {
+    #[new]
+    fn new(py: Python<'_>, address: String) -> PyResult<Self> {
+        let session = py.detach(|| Session::open(&address))?;
+        Ok(Self { session: Mutex::new(Some(Arc::new(session))) })
+    }
+
+    /// Its address.
+    #[getter]
+    fn address(&self) -> PyResult<String> {
+        Ok(self.session()?.address.clone())
+    }
+
+    /// Whether it is closed.
+    #[getter]
+    fn closed(&self) -> bool {
+        lock(&self.session).is_none()
+    }
+
+    /// Whether a vehicle with a database of its own is on its buses.
+    #[getter]
+    fn is_virtual_car(&self) -> PyResult<bool> {
+        Ok(self.session()?.is_car)
+    }
+
+    /// What it is.
+    fn info<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let session = self.session()?;
+        let hello = session.device()?.hello();
+        let [major, minor, patch] = hello.firmware;
+        let object = json!({
+            "board": hello.board.as_str(),
+            "serial": hello.serial.as_str(),
+            "firmware": format!("{major}.{minor}.{patch}"),
+            "protocol": hello.protocol,
+            "channels": hello.channels,
+            "tick_hz": hello.tick_hz,
+            "can_clock_hz": hello.can_clock_hz,
+            "tx_queue": hello.tx_queue,
+            "periodic_slots": hello.periodic_slots,
+            "reply_slots": hello.trigger_slots,
+            "transmits": hello.capabilities & capability::TRANSMIT != 0,
+        });
+        from_json(py, &object.to_string())
+    }
+
+    /// Opens a channel. Returns its bit rate, and what of its filters this computer has to do.
+    fn open_channel(
+        &self,
+        py: Python<'_>,
+        number: u8,
+        options: ChannelOptions,
+    ) -> PyResult<(u32, Option<String>)> {
+        let session = self.session()?;
+        let channel = channel(number)?;
+        let opened = py.detach(|| -> Result<_, Error> {
+            let device = session.device()?;
+            let found = MODES.iter().find(|(_, name)| *name == options.mode);
+            let Some((mode, _)) = found else {
+                let words = format!(
+                    "'{}' is no mode; there are listen-only, normal, loopback and silent-loopback",
+                    options.mode
+                );
+                return Err(Error::argument(words));
+            };
+            let filters = options.filters.iter().map(|text| text.parse::<Filter>()).collect::<Result<Vec<_>, _>>();
+            let filters = filters.map_err(Error::argument)?;
+            let clock_hz = device.hello().can_clock_hz;
+            let request = match options.segments {
+                Some((prescaler, segment1, segment2, jump_width)) => {
+                    Some(TimingRequest::Exact(BitTiming { prescaler, segment1, segment2, jump_width }))
+                }
+                None => options.bitrate.or_else(|| session.bitrate_of_bus(channel)).map(|bitrate_bps| {
+                    let sample_point_percent = options.sample_point;
+                    TimingRequest::Rate { bitrate_bps, sample_point_percent, sjw: options.sjw }
+                }),
+            };
+            let timing = match request {
+                Some(request) => request.resolve(clock_hz).map_err(Error::argument)?,
+                None => match device.defaults(channel)? {
+                    Some(saved) => saved.config.timing,
+                    None => {
+                        let words = format!(
+                            "nothing is saved on the device for channel {number}; give bitrate=, such as 500_000"
+                        );
+                        return Err(Error::argument(words));
+                    }
+                },
+            };
+            let config = ChannelConfig {
+                mode: *mode,
+                one_shot: options.one_shot,
+                manual_recovery: options.manual_recovery,
+                ..ChannelConfig::listen_only(timing)
+            };
+            let remainder = session.open_channel(channel, config, &filters)?;
+            Ok((timing.bitrate_bps(clock_hz), remainder.map(|remainder| remainder.to_string())))
+        })?;
+        Ok(opened)
+    }
+
+    /// Closes a channel, after everything it captured has come.
+    fn close_channel(&self, py: Python<'_>, number: u8) -> PyResult<()> {
+        let channel = channel(number)?;
+        self.ask(py, |device| device.close_channel(channel))
+    }
+
+    /// How open channels are: by number, bit rate and mode.
+    fn open_channels<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let session = self.session()?;
+        let device = session.device()?;
+        let open = PyDict::new(py);
+        for (channel, config) in device.open_channels() {
+            let about = PyDict::new(py);
+            about.set_item("bitrate", config.timing.bitrate_bps(device.hello().can_clock_hz))?;
+            about.set_item("mode", name(&MODES, &config.mode))?;
+            open.set_item(channel.number(), about)?;
+        }
+        Ok(open)
+    }
+
+    /// Hears from now on; what waits is at most `capacity` records.
+    #[pyo3(signature = (channel_number=None, filters=vec![], only_received=false, capacity=1 << 20))]
+    fn records(
+        slf: &Bound<'_, Self>,
+        channel_number: Option<u8>,
+        filters: Vec<String>,
+        only_received: bool,
+        capacity: usize,
+    ) -> PyResult<Records> {
+        let session = slf.get().session()?;
+        let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<Filter>, _>>();
+        let filters = filters.map_err(Error::argument)?;
+        if let Some(number) = channel_number {
+            channel(number)?;
+        }
+        let listener =
+            session.fanout.listen(Wanted { channel: channel_number, filters, only_received }, capacity);
+        Ok(Records::new(slf.clone().unbind(), listener))
+    }
+
+    /// Sends frames and returns when each was on the bus, in nanoseconds since 1970; without `timeout` they are only handed to the device.
+    #[pyo3(signature = (number, frames, timeout, at_ns=None, queue_timeout=1.0))]
+    fn send(
+        &self,
+        py: Python<'_>,
+        number: u8,
+        frames: Vec<AnyFrame>,
+        timeout: Option<f64>,
+        at_ns: Option<i64>,
+        queue_timeout: f64,
+    ) -> PyResult<Vec<i64>> {
+        let session = self.session()?;
+        let channel = channel(number)?;
+        let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
+        let seconds = timeout.unwrap_or(queue_timeout);
+        let patience = Duration::try_from_secs_f64(seconds)
+            .map_err(|_| PyValueError::new_err(format!("{seconds} s is no time to wait")))?
+            .min(MOST_TIME);
+        let ended = py.detach(|| -> Result<_, Error> {
+            let device = session.device()?;
+            let at_ticks = at_ns.map(|at_ns| device.clock_map().ticks(cantap::device::UtcNs(at_ns)).0);
+            let deadline = Instant::now() + patience;
+            let sending = session.send(channel, &frames, at_ticks, timeout.is_some(), deadline, signals)?;
+            let ended = sending.wait(deadline, SLICE, signals);
+            // Nobody may be surprised by it later.
+            if timeout.is_some() && !matches!(ended, Ok(Some(_))) {
+                device.abort(channel)?;
+            }
+            ended
+        })?;
+        let Some(ended) = ended else {
+            return Err(DeviceError::new_err(format!(
+                "not sent on channel {number} within {} s, and taken back; does another node acknowledge, at the same bit rate?",
+                patience.as_secs_f64()
+            )));
+        };
+        for (end, frame) in ended.iter().zip(&frames) {
+            if end.result.is_err() {
+                return Err(not_sent(end, frame).into());
+            }
+        }
+        Ok(ended.iter().map(|end| end.time_ns).collect())
+    }
+
+    /// Takes back what a channel still has to send.
+    fn abort(&self, py: Python<'_>, number: u8) -> PyResult<()> {
+        let channel = channel(number)?;
+        self.ask(py, |device| device.abort(channel))
+    }
+
+    /// Begins a periodic frame.
+    fn periodic(
+        &self,
+        py: Python<'_>,
+        number: u8,
+        frame: AnyFrame,
+        period_s: f64,
+        count: u32,
+        modifiers: Vec<tasks::ModifierWords>,
+    ) -> PyResult<PeriodicFrame> {
+        let session = self.session()?;
+        let channel = channel(number)?;
+        Ok(py.detach(|| PeriodicFrame::begin(session, channel, frame.0, period_s, count, &modifiers))?)
+    }
+
+    /// Begins to reply.
+    fn reply(
+        &self,
+        py: Python<'_>,
+        number: u8,
+        to: tasks::Match,
+        frame: AnyFrame,
+        count: u32,
+    ) -> PyResult<Reply> {
+        let session = self.session()?;
+        let channel = channel(number)?;
+        Ok(py.detach(|| Reply::begin(session, channel, to, frame.0, count))?)
+    }
+
+    /// How the device and its channels are.
+    fn status<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let status = self.ask(py, cantap::Device::status)?;
+        let channels = Channel::ALL.map(|channel| {
+            let state = &status.channels[channel.index()];
+            json!({
+                "channel": channel.number(),
+                "is_open": state.open.is_some(),
+                "mode": state.open.map(|config| name(&MODES, &config.mode)),
+                "state": name(&ERROR_STATES, &state.state),
+                "tx_errors": state.tec,
+                "rx_errors": state.rec,
+                "last_error": state.last_error.map(|kind| name(&BUS_ERRORS, &kind)),
+                "frames": state.frames,
+                "lost_controller": state.lost_controller,
+                "lost_queue": state.lost_queue,
+                "bus_errors": state.bus_errors,
+                "transmitted": state.transmitted,
+                "transmit_failures": state.transmit_failures,
+                "tx_pending": state.tx_pending,
+            })
+        });
+        let object = json!({
+            "queue_bytes": status.queue_bytes,
+            "queue_high_water_bytes": status.queue_high_water_bytes,
+            "temperature_c": status.temperature_decicelsius.map(|tenths| f64::from(tenths) / 10.0),
+            "supply_v": status.supply_millivolts.map(|millivolts| f64::from(millivolts) / 1000.0),
+            "channels": channels,
+        });
+        from_json(py, &object.to_string())
+    }
+
+    /// Frames that came and that were lost since the session began, by channel and stage.
+    fn losses<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let session = self.session()?;
+        let counters = session.device()?.counters();
+        let all = PyDict::new(py);
+        for channel in Channel::ALL {
+            let of = &counters.channels[channel.index()];
+            let counts = PyDict::new(py);
+            counts.set_item("received", of.received)?;
+            counts.set_item("controller", of.lost_controller)?;
+            counts.set_item("queue", of.lost_queue)?;
+            counts.set_item("link", of.lost_link)?;
+            counts.set_item("host", of.lost_host)?;
+            counts.set_item("lost", of.lost())?;
+            all.set_item(channel.number(), counts)?;
+        }
+        Ok(all)
+    }
+
+    /// What is known about its clock.
+    fn clock<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let session = self.session()?;
+        let report = session.device()?.clock();
+        let object = json!({
+            "source": if report.source == ClockSource::Frames { "frames" } else { "round-trips" },
+            "drift_ppm": report.drift_ppm,
+            "uncertainty_ns": report.uncertainty_ns,
+            "round_trip_ns": report.round_trip_ns,
+        });
+        from_json(py, &object.to_string())
+    }
+
+    /// The device's time in UTC nanoseconds since 1970.
+    fn time_ns(&self, py: Python<'_>) -> PyResult<i64> {
+        self.ask(py, |device| {
+            let ticks = device.time()?;
+            Ok(device.clock_map().utc(cantap::device::Ticks(ticks)).0)
+        })
+    }
+
+    /// Brings a channel back from bus-off that was opened with manual recovery.
+    fn recover(&self, py: Python<'_>, number: u8) -> PyResult<()> {
+        let channel = channel(number)?;
+        self.ask(py, |device| device.recover(channel))
+    }
+
+    /// Shows an LED pattern, to find it among others.
+    fn identify(&self, py: Python<'_>, seconds: u8) -> PyResult<()> {
+        self.ask(py, |device| device.identify(seconds))
+    }
+
+    /// Closes the channels and ends the session; records that came can still be read.
+    fn close(&self, py: Python<'_>) -> PyResult<()> {
+        let Some(session) = lock(&self.session).take() else { return Ok(()) };
+        py.detach(|| {
+            if let Ok(device) = session.device() {
+                // What was captured until the end still comes. If the device is gone, its records end by themselves.
+                let _ = device.stop();
+            }
+            drop(session);
+        });
+        Ok(())
+    }
+}
+
+/// The boards that are connected: port, serial number, product.
+#[pyfunction]
+pub fn list_boards(py: Python<'_>) -> PyResult<Vec<(String, Option<String>, Option<String>)>> {
+    let boards = py.detach(cantap::device::list).map_err(Error::from)?;
+    Ok(boards.into_iter().map(|board| (board.port, board.serial_number, board.product)).collect())
+}
+
+/// Adds the classes to the module.
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_class::<Device>()?;
+    module.add_class::<Records>()?;
+    module.add_class::<PeriodicFrame>()?;
+    module.add_class::<Reply>()?;
+    module.add_function(wrap_pyfunction!(list_boards, module)?)
+}

@@ -1,0 +1,232 @@
+//! What is heard, for Python.
+
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use cantap_columns::FrameColumns;
+use cantap_trace::TraceRecord;
+use cantap_trace::socketcan::ErrorFrame;
+use cantap_trace::{Direction, TraceEvent};
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use super::Device;
+use super::fanout::{Listener, lock};
+use crate::error::{DeviceError, Error};
+use crate::frame::Record;
+use crate::table::Table;
+
+/// How long Python's signals may wait.
+pub const SLICE: Duration = Duration::from_millis(50);
+
+/// The records of a device from the time on at which this was made. Several are independent of each other.
+#[pyclass(module = "cantap", frozen)]
+pub struct Records {
+    /// Kept, so that a device that nobody closes is there for as long as somebody listens.
+    _device: Py<Device>,
+    listener: Arc<Listener>,
+    waiting: Mutex<std::vec::IntoIter<TraceRecord>>,
+}
+
+/// Until when to wait for something.
+#[derive(Clone, Copy)]
+pub struct Until(Option<Instant>);
+
+impl Until {
+    /// From seconds; for ever without.
+    pub fn of(timeout: Option<f64>) -> Result<Self, Error> {
+        let Some(seconds) = timeout else { return Ok(Self(None)) };
+        let time = Duration::try_from_secs_f64(seconds.max(0.0));
+        let time = time.map_err(|_| Error::argument(format!("{seconds} s is no time to wait")))?;
+        Ok(Self(Instant::now().checked_add(time)))
+    }
+
+    /// What is left, at most a slice; none when it is over.
+    fn slice(self) -> Option<Duration> {
+        let Some(deadline) = self.0 else { return Some(SLICE) };
+        let left = deadline.saturating_duration_since(Instant::now());
+        (!left.is_zero()).then_some(left.min(SLICE))
+    }
+}
+
+/// What came of waiting.
+enum Next {
+    One(TraceRecord),
+    Nothing,
+    End,
+}
+
+impl Records {
+    pub fn new(device: Py<Device>, listener: Arc<Listener>) -> Self {
+        Self { _device: device, listener, waiting: Mutex::default() }
+    }
+
+    /// One that is there already.
+    fn at_hand(&self) -> Option<TraceRecord> {
+        let mut waiting = lock(&self.waiting);
+        let next = waiting.next();
+        if next.is_some() && waiting.as_slice().is_empty() {
+            self.listener.used_up();
+        }
+        next
+    }
+
+    fn next(&self, py: Python<'_>, until: Until) -> PyResult<Next> {
+        if let Some(record) = self.at_hand() {
+            return Ok(Next::One(record));
+        }
+        let mut slice = Duration::ZERO;
+        loop {
+            match py.detach(|| self.listener.pop(slice)) {
+                None => {
+                    let failure = self.listener.failure();
+                    return failure.map_or(Ok(Next::End), |failure| Err(DeviceError::new_err(failure)));
+                }
+                Some(batch) if batch.is_empty() => {}
+                Some(batch) => {
+                    *lock(&self.waiting) = batch.into_iter();
+                    if let Some(record) = self.at_hand() {
+                        return Ok(Next::One(record));
+                    }
+                }
+            }
+            py.check_signals()?;
+            match until.slice() {
+                Some(next) => slice = next,
+                None => {
+                    self.listener.used_up();
+                    return Ok(Next::Nothing);
+                }
+            }
+        }
+    }
+}
+
+/// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; length code, data,
+/// whether it was received, channel from 1.
+type Message<'py> = (f64, u32, bool, bool, bool, u8, Bound<'py, PyBytes>, bool, u8);
+
+fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
+    let time_s = record.time_ns as f64 / 1e9;
+    let channel = record.channel;
+    if let TraceEvent::Frame { frame, direction, .. } = &record.event {
+        let (id, is_rx) = (frame.id(), *direction == Direction::Rx);
+        let data = PyBytes::new(py, frame.data());
+        return (
+            time_s,
+            id.raw(),
+            id.is_extended(),
+            frame.is_remote(),
+            false,
+            frame.dlc(),
+            data,
+            is_rx,
+            channel,
+        );
+    }
+    let (classes, data) =
+        ErrorFrame::of(&record.event).map_or((0, [0; 8]), |error| (error.classes, error.data));
+    (time_s, classes, true, false, true, 8, PyBytes::new(py, &data), true, channel)
+}
+
+#[pymethods]
+impl Records {
+    fn __iter__(slf: Py<Self>) -> Py<Self> {
+        slf
+    }
+
+    fn __next__(&self, py: Python<'_>) -> PyResult<Option<Record>> {
+        match self.next(py, Until(None))? {
+            Next::One(record) => Ok(Some(Record(record))),
+            Next::Nothing | Next::End => Ok(None),
+        }
+    }
+
+    /// The next record; `None` if there is none within `timeout` seconds, or after the last.
+    #[pyo3(signature = (timeout=None))]
+    fn read(&self, py: Python<'_>, timeout: Option<f64>) -> PyResult<Option<Record>> {
+        match self.next(py, Until::of(timeout)?)? {
+            Next::One(record) => Ok(Some(Record(record))),
+            Next::Nothing | Next::End => Ok(None),
+        }
+    }
+
+    /// Records of up to `seconds`, at most `rows`, as a table; fewer after the device was closed.
+    #[pyo3(signature = (seconds=None, rows=65_536))]
+    fn batch(&self, py: Python<'_>, seconds: Option<f64>, rows: usize) -> PyResult<Table> {
+        if rows == 0 {
+            return Err(Error::argument("a batch has at least one row").into());
+        }
+        let until = Until::of(seconds)?;
+        let mut columns = FrameColumns::default();
+        let mut left = rows;
+        while left > 0 {
+            match self.next(py, until)? {
+                Next::One(record) => columns.push(&record),
+                Next::Nothing | Next::End => break,
+            }
+            left -= 1;
+            // The rest of what came with it, in one go.
+            let mut waiting = lock(&self.waiting);
+            let at_hand = waiting.as_slice().len().min(left);
+            waiting.by_ref().take(at_hand).for_each(|record| columns.push(&record));
+            left -= at_hand;
+            let is_used_up = waiting.as_slice().is_empty();
+            drop(waiting);
+            if is_used_up {
+                self.listener.used_up();
+            }
+        }
+        Ok(Table::of_batch(columns.take()))
+    }
+
+    /// For the plugin: the next record as python-can's message; `None` if there is none within the time.
+    fn _message<'py>(&self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Option<Message<'py>>> {
+        match self.next(py, Until::of(timeout)?)? {
+            Next::One(record) => Ok(Some(message(py, &record))),
+            Next::Nothing => Ok(None),
+            Next::End => Err(DeviceError::new_err("the device is closed")),
+        }
+    }
+
+    /// For the plugin: what is heard from now on.
+    fn _filter(&self, filters: Vec<String>, only_received: bool) -> PyResult<()> {
+        let filters = filters.iter().map(|text| text.parse()).collect::<Result<Vec<_>, _>>();
+        let filters = filters.map_err(Error::argument)?;
+        self.listener.want(|wanted| {
+            wanted.filters = filters;
+            wanted.only_received = only_received;
+        });
+        Ok(())
+    }
+
+    /// For the plugin: drops what waits.
+    fn _clear(&self) {
+        *lock(&self.waiting) = Vec::new().into_iter();
+        while self.listener.pop(Duration::ZERO).is_some_and(|batch| !batch.is_empty()) {}
+        self.listener.used_up();
+    }
+
+    /// Frames lost here because this program did not take them, of channel 1 and 2.
+    #[getter]
+    fn lost(&self) -> (u64, u64) {
+        let [first, second] = self.listener.lost();
+        (first, second)
+    }
+
+    /// A file descriptor that is readable while a record waits.
+    fn fileno(&self) -> PyResult<i32> {
+        let is_waiting = !lock(&self.waiting).as_slice().is_empty();
+        self.listener.signal(is_waiting)?;
+        #[cfg(unix)]
+        if let Some(descriptor) = self.listener.descriptor() {
+            return Ok(descriptor);
+        }
+        Err(pyo3::exceptions::PyNotImplementedError::new_err("this system waits for no file descriptors"))
+    }
+
+    /// Hears nothing more; what waits can still be read.
+    fn close(&self) {
+        self.listener.end(None);
+    }
+}

@@ -1,0 +1,226 @@
+//! A session with a device, for everybody in this process who uses it.
+
+use std::collections::HashMap;
+use std::mem::ManuallyDrop;
+use std::sync::atomic::{AtomicU32, Ordering};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, sync_channel};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use cantap::device::Transmission;
+use cantap::hw_filter::{self, Remainder};
+use cantap::wire::Refusal;
+use cantap::wire::message::{ChannelConfig, MAX_SEND, TxFrame};
+use cantap::{Channel, Device, DeviceError, Frame};
+use cantap_address::{Address, OpenDevice};
+use cantap_trace::filter::Filter;
+
+use super::fanout::{Fanout, lock};
+use crate::error::Error;
+
+/// Tags wrap here: a device keeps those from `DEVICE_TAG` up for itself.
+const TAGS: u32 = 0x7FFF_0000;
+/// While the device's queue is full it is tried again after this time.
+const RETRY_AFTER: Duration = Duration::from_millis(1);
+
+/// A session.
+pub struct Session {
+    /// Never dropped in another process than the one that opened it, see [`Drop`].
+    device: ManuallyDrop<OpenDevice>,
+    pub address: String,
+    pub is_car: bool,
+    process: u32,
+    pub fanout: Arc<Fanout>,
+    next_tag: AtomicU32,
+    /// Entries of the device's tables in use.
+    slots: Mutex<HashMap<(Table, Channel), Vec<bool>>>,
+}
+
+/// A table of what a device sends by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Table {
+    /// Again and again.
+    Periodic,
+    /// In reply.
+    Replies,
+}
+
+impl Session {
+    /// Begins a session with the device at an address.
+    pub fn open(address: &str) -> Result<Self, Error> {
+        let place = address.parse::<Address>().map_err(Error::argument)?;
+        let device = place.open().map_err(|error| match error.downcast::<DeviceError>() {
+            Ok(error) => Error::Device(error),
+            Err(error) => Error::Address(format!("{error:#}")),
+        })?;
+        let fanout = Arc::new(Fanout::default());
+        let (records, ends) = (device.records(), device.transmissions());
+        let for_records = Arc::clone(&fanout);
+        spawn("cantap-records", move || for_records.pump(records))?;
+        let for_ends = Arc::clone(&fanout);
+        spawn("cantap-ends", move || for_ends.report(&ends))?;
+        Ok(Self {
+            device: ManuallyDrop::new(device),
+            address: address.to_owned(),
+            is_car: place.is_car(),
+            process: std::process::id(),
+            fanout,
+            next_tag: AtomicU32::new(1),
+            slots: Mutex::default(),
+        })
+    }
+
+    /// The device, in the process that opened it: after a fork the thread that reads it is in the other one.
+    pub fn device(&self) -> Result<&Device, Error> {
+        if self.process == std::process::id() {
+            Ok(&self.device)
+        } else {
+            Err(Error::Address(format!(
+                "'{}' was opened by another process, before a fork; open it in the process that uses it",
+                self.address
+            )))
+        }
+    }
+
+    /// The bit rate of a channel's bus in bit/s, if it is known without listening.
+    pub fn bitrate_of_bus(&self, channel: Channel) -> Option<u32> {
+        self.device.bitrate_of_bus(channel)
+    }
+
+    /// Opens a channel; what its filters leave to this computer is returned.
+    pub fn open_channel(
+        &self,
+        channel: Channel,
+        config: ChannelConfig,
+        filters: &[Filter],
+    ) -> Result<Option<Remainder>, Error> {
+        let device = self.device()?;
+        let compiled = hw_filter::apply(device, channel, filters)?;
+        // Before the first frame comes.
+        self.fanout.set_filters(channel, filters.to_vec());
+        device.open_channel(channel, Some(config))?;
+        Ok(compiled.remainder)
+    }
+
+    /// Hands frames to the device, to be sent not before a device time. With `told`, how each ended can be waited for; while
+    /// the device's queue is full it is waited for until `deadline`, as long as `go_on` says so.
+    pub fn send(
+        &self,
+        channel: Channel,
+        frames: &[Frame],
+        at_ticks: Option<u64>,
+        is_told: bool,
+        deadline: Instant,
+        mut go_on: impl FnMut() -> Result<(), Error>,
+    ) -> Result<Sending, Error> {
+        let device = self.device()?;
+        let mut sending = Sending { fanout: Arc::clone(&self.fanout), ends: Vec::new() };
+        for chunk in frames.chunks(MAX_SEND) {
+            let mut batch = heapless::Vec::<TxFrame, MAX_SEND>::new();
+            for frame in chunk {
+                let tag = self.next_tag.fetch_add(1, Ordering::Relaxed) % TAGS;
+                if is_told {
+                    let (told, end) = sync_channel(1);
+                    self.fanout.wait_for(tag, told);
+                    sending.ends.push((tag, end));
+                }
+                // Cannot fail: a chunk is no longer.
+                let _ = batch.push(TxFrame { tag, frame: *frame, at_ticks });
+            }
+            while let Err(error) = device.send(channel, &batch) {
+                let is_full = matches!(error, DeviceError::Refused { refusal: Refusal::QueueFull { .. } });
+                if !is_full || Instant::now() >= deadline {
+                    return Err(error.into());
+                }
+                go_on()?;
+                std::thread::sleep(RETRY_AFTER);
+            }
+        }
+        Ok(sending)
+    }
+
+    /// Takes a free entry of a table.
+    pub fn take_slot(&self, table: Table, channel: Channel) -> Result<u8, Error> {
+        let hello = self.device()?.hello();
+        let (count, what) = match table {
+            Table::Periodic => (hello.periodic_slots, "periodic frames"),
+            Table::Replies => (hello.trigger_slots, "replies"),
+        };
+        let mut slots = lock(&self.slots);
+        let slots = slots.entry((table, channel)).or_insert_with(|| vec![false; usize::from(count)]);
+        let Some(free) = slots.iter().position(|taken| !taken) else {
+            return Err(Error::Address(format!(
+                "the device has room for {count} {what} per channel; stop one first"
+            )));
+        };
+        slots[free] = true;
+        Ok(free as u8)
+    }
+
+    /// Gives it back.
+    pub fn free_slot(&self, table: Table, channel: Channel, slot: u8) {
+        if let Some(slots) = lock(&self.slots).get_mut(&(table, channel)) {
+            slots[usize::from(slot)] = false;
+        }
+    }
+}
+
+fn spawn(name: &str, work: impl FnOnce() + Send + 'static) -> Result<(), Error> {
+    let thread = std::thread::Builder::new().name(name.to_owned()).spawn(work);
+    thread.map(drop).map_err(|error| Error::Device(DeviceError::Thread(error)))
+}
+
+impl Drop for Session {
+    /// Leaves the bus. A copy of the session in a forked process does nothing: the port belongs to the other one, and so does the
+    /// thread that would have to be waited for.
+    fn drop(&mut self) {
+        if self.process == std::process::id() {
+            // SAFETY: nothing uses it after this.
+            unsafe { ManuallyDrop::drop(&mut self.device) };
+        }
+    }
+}
+
+/// Frames that are with the device.
+pub struct Sending {
+    fanout: Arc<Fanout>,
+    /// In the order in which they were handed over.
+    ends: Vec<(u32, Receiver<Transmission>)>,
+}
+
+impl Sending {
+    /// How the frames ended, in order. `None` if one has not until `deadline`.
+    pub fn wait(
+        &self,
+        deadline: Instant,
+        slice: Duration,
+        mut go_on: impl FnMut() -> Result<(), Error>,
+    ) -> Result<Option<Vec<Transmission>>, Error> {
+        let mut ended = Vec::with_capacity(self.ends.len());
+        for (_, end) in &self.ends {
+            loop {
+                let left = deadline.saturating_duration_since(Instant::now());
+                match end.recv_timeout(left.min(slice)) {
+                    Ok(end) => {
+                        ended.push(end);
+                        break;
+                    }
+                    Err(RecvTimeoutError::Timeout) if left.is_zero() => return Ok(None),
+                    Err(RecvTimeoutError::Timeout) => go_on()?,
+                    Err(RecvTimeoutError::Disconnected) => {
+                        return Err(Error::Address(
+                            "the device is gone; what became of the frame is not known".to_owned(),
+                        ));
+                    }
+                }
+            }
+        }
+        Ok(Some(ended))
+    }
+}
+
+impl Drop for Sending {
+    fn drop(&mut self) {
+        self.fanout.forget(&self.ends.iter().map(|(tag, _)| *tag).collect::<Vec<_>>());
+    }
+}

@@ -1,0 +1,186 @@
+//! What the device sends by itself: again and again, and in reply. It ends with the object that asked for it.
+
+use std::sync::{Arc, Mutex, Weak};
+use std::time::Duration;
+
+use cantap::periodic::{check_modifiers, period_ticks};
+use cantap::wire::message::{Checksum, Filter, FrameKind, MAX_MODIFIERS, Modifier, Periodic, Trigger};
+use cantap::{Channel, Frame, Id};
+use pyo3::prelude::*;
+
+use super::fanout::lock;
+use super::session::{Session, Table};
+use crate::error::Error;
+use crate::frame::{AnyFrame, identifier};
+
+/// A modifier as Python has it: what it is, the byte, and two numbers or a name.
+pub type ModifierWords = (String, u8, u8, u8, String);
+
+/// What is replied to: identifier, mask, whether it has 29 bits.
+pub type Match = (u32, Option<u32>, Option<bool>);
+
+fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Modifier, Error> {
+    let byte = *byte;
+    Ok(match kind.as_str() {
+        "counter" => Modifier::Counter { byte, low_bit: *low_bit, bits: *bits },
+        "random" => Modifier::Random { byte },
+        _ => {
+            let algorithm = match algorithm.as_str() {
+                "xor" => Checksum::Xor,
+                "sum" => Checksum::Sum,
+                "crc8-j1850" => Checksum::Crc8J1850,
+                other => {
+                    let words = format!("'{other}' is no checksum; there are xor, sum and crc8-j1850");
+                    return Err(Error::argument(words));
+                }
+            };
+            Modifier::Checksum { byte, algorithm }
+        }
+    })
+}
+
+/// An entry of a table of the device's.
+struct Entry {
+    /// Gone when the device is closed, and with it everything that it sends by itself.
+    session: Weak<Session>,
+    table: Table,
+    channel: Channel,
+    slot: Mutex<Option<u8>>,
+}
+
+impl Entry {
+    fn take(session: &Arc<Session>, table: Table, channel: Channel) -> Result<Self, Error> {
+        let slot = session.take_slot(table, channel)?;
+        Ok(Self { session: Arc::downgrade(session), table, channel, slot: Mutex::new(Some(slot)) })
+    }
+
+    /// Ends it; what has ended stays so.
+    fn clear(&self) -> Result<(), Error> {
+        let Some(slot) = lock(&self.slot).take() else { return Ok(()) };
+        let Some(session) = self.session.upgrade() else { return Ok(()) };
+        let device = session.device()?;
+        let cleared = match self.table {
+            Table::Periodic => device.set_periodic(self.channel, slot, None),
+            Table::Replies => device.set_trigger(self.channel, slot, None),
+        };
+        session.free_slot(self.table, self.channel, slot);
+        Ok(cleared?)
+    }
+}
+
+impl Drop for Entry {
+    fn drop(&mut self) {
+        // If it cannot be told, the device is gone, and the session with it.
+        let _ = self.clear();
+    }
+}
+
+/// A frame that the device sends again and again, by its own timer, until this is stopped or forgotten.
+#[pyclass(module = "cantap", frozen)]
+pub struct PeriodicFrame {
+    entry: Entry,
+    set: Mutex<Periodic>,
+}
+
+impl PeriodicFrame {
+    pub fn begin(
+        session: Arc<Session>,
+        channel: Channel,
+        frame: Frame,
+        period_s: f64,
+        count: u32,
+        modifiers: &[ModifierWords],
+    ) -> Result<Self, Error> {
+        let period = Duration::try_from_secs_f64(period_s)
+            .map_err(|_| Error::argument(format!("{period_s} s is no period")))?;
+        let ticks = period_ticks(period, session.device()?.hello().tick_hz).map_err(Error::argument)?;
+        let list = modifiers.iter().map(modifier).collect::<Result<Vec<_>, _>>()?;
+        check_modifiers(&frame, &list).map_err(Error::argument)?;
+        let modifiers = heapless::Vec::from_slice(&list).map_err(|_| {
+            Error::argument(format!("a periodic frame has at most {MAX_MODIFIERS} modifiers"))
+        })?;
+        let set = Periodic { frame, period_ticks: ticks, count, modifiers };
+        let entry = Entry::take(&session, Table::Periodic, channel)?;
+        let task = Self { entry, set: Mutex::new(set) };
+        task.apply()?;
+        Ok(task)
+    }
+
+    fn apply(&self) -> Result<(), Error> {
+        let slot = lock(&self.entry.slot);
+        let (Some(slot), Some(session)) = (*slot, self.entry.session.upgrade()) else {
+            return Err(Error::Address("this periodic frame was stopped; begin another one".to_owned()));
+        };
+        let set = lock(&self.set).clone();
+        Ok(session.device()?.set_periodic(self.entry.channel, slot, Some(set))?)
+    }
+}
+
+#[pymethods]
+impl PeriodicFrame {
+    /// Whether it goes on, as far as it was not given a count.
+    #[getter]
+    fn is_running(&self) -> bool {
+        lock(&self.entry.slot).is_some()
+    }
+
+    /// Sends another frame from now on; its period begins anew.
+    fn update(&self, py: Python<'_>, frame: AnyFrame) -> PyResult<()> {
+        let changed = {
+            let set = lock(&self.set);
+            check_modifiers(&frame.0, &set.modifiers).map_err(Error::argument)
+        };
+        changed?;
+        lock(&self.set).frame = frame.0;
+        Ok(py.detach(|| self.apply())?)
+    }
+
+    /// Ends it.
+    fn stop(&self, py: Python<'_>) -> PyResult<()> {
+        Ok(py.detach(|| self.entry.clear())?)
+    }
+}
+
+/// A frame that the device sends whenever it receives a matching one, until this is stopped or forgotten.
+#[pyclass(module = "cantap", frozen)]
+pub struct Reply {
+    entry: Entry,
+}
+
+impl Reply {
+    pub fn begin(
+        session: Arc<Session>,
+        channel: Channel,
+        (id, mask, extended): Match,
+        reply: Frame,
+        count: u32,
+    ) -> Result<Self, Error> {
+        let id = identifier(id, extended)?;
+        let widest = if id.is_extended() { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+        let mask = mask.unwrap_or(widest);
+        if mask > widest {
+            return Err(Error::argument(format!(
+                "the mask {mask:#X} has more bits than the identifier, {widest:#X}"
+            )));
+        }
+        let filter = Filter { extended: id.is_extended(), kind: FrameKind::Any, id: id.raw() & mask, mask };
+        let entry = Entry::take(&session, Table::Replies, channel)?;
+        let slot = lock(&entry.slot).unwrap_or_default();
+        session.device()?.set_trigger(channel, slot, Some(Trigger { filter, reply, count }))?;
+        Ok(Self { entry })
+    }
+}
+
+#[pymethods]
+impl Reply {
+    /// Whether it goes on, as far as it was not given a count.
+    #[getter]
+    fn is_running(&self) -> bool {
+        lock(&self.entry.slot).is_some()
+    }
+
+    /// Ends it.
+    fn stop(&self, py: Python<'_>) -> PyResult<()> {
+        Ok(py.detach(|| self.entry.clear())?)
+    }
+}

@@ -1,0 +1,174 @@
+//! What Python code catches.
+
+use std::io;
+use std::path::Path;
+
+use cantap::DeviceError as DeviceFault;
+use cantap_columns::BadColumns;
+use cantap_columns::parquet::ParquetError;
+use cantap_formats::{Fault, NothingRead, OpenError, ReadIssue};
+use cantap_signals::condition::ConditionError;
+use cantap_signals::encode::EncodeError;
+use cantap_signals::{DatabaseError as DatabaseFault, SelectionError};
+use pyo3::exceptions::{PyException, PyOSError, PyUserWarning, PyValueError};
+use pyo3::prelude::*;
+
+pyo3::create_exception!(cantap, CantapError, PyException, "The base of all errors of this package.");
+pyo3::create_exception!(
+    cantap,
+    DeviceError,
+    CantapError,
+    "A device could not be opened, refused a request, or is gone."
+);
+pyo3::create_exception!(
+    cantap,
+    FormatError,
+    CantapError,
+    "A file is no trace of a format that is read or written."
+);
+pyo3::create_exception!(
+    cantap,
+    DatabaseError,
+    CantapError,
+    "A signal database cannot be used, or does not fit."
+);
+pyo3::create_exception!(
+    cantap,
+    CantapWarning,
+    PyUserWarning,
+    "Something was left out, and the rest can be used."
+);
+
+/// An error of this package's libraries.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// Of a file, with its name.
+    #[error("{1}: {0}")]
+    Io(#[source] io::Error, String),
+    /// No trace of this format.
+    #[error("{0}")]
+    Format(String),
+    /// Of a database.
+    #[error("{0}")]
+    Database(String),
+    /// Of a device.
+    #[error(transparent)]
+    Device(#[from] DeviceFault),
+    /// The way to a device.
+    #[error("{0}")]
+    Address(String),
+    /// A wrong argument.
+    #[error("{0}")]
+    Argument(String),
+    /// What Python itself raised.
+    #[error("{0}")]
+    Python(#[from] PyErr),
+}
+
+impl Error {
+    /// What the system says about a file.
+    pub fn of_file(error: io::Error, path: &Path) -> Self {
+        Self::Io(error, path.display().to_string())
+    }
+
+    /// A wrong argument, in words.
+    pub fn argument(words: impl ToString) -> Self {
+        Self::Argument(words.to_string())
+    }
+}
+
+impl From<OpenError> for Error {
+    fn from(error: OpenError) -> Self {
+        match error {
+            OpenError::Io(file, error) => Self::Io(error, file),
+            error => Self::Format(error.to_string()),
+        }
+    }
+}
+
+impl From<ReadIssue> for Error {
+    fn from(issue: ReadIssue) -> Self {
+        match issue.fault {
+            Fault::Io(error) => Self::Io(error, issue.file.to_string()),
+            _ => Self::Format(issue.to_string()),
+        }
+    }
+}
+
+impl From<NothingRead> for Error {
+    fn from(nothing: NothingRead) -> Self {
+        Self::Format(nothing.to_string())
+    }
+}
+
+impl From<BadColumns> for Error {
+    fn from(error: BadColumns) -> Self {
+        Self::Format(error.to_string())
+    }
+}
+
+impl From<ParquetError> for Error {
+    fn from(error: ParquetError) -> Self {
+        Self::Format(error.to_string())
+    }
+}
+
+impl From<DatabaseFault> for Error {
+    fn from(error: DatabaseFault) -> Self {
+        match error {
+            DatabaseFault::Read { file, source } => Self::Io(source, file),
+            error => Self::Database(error.to_string()),
+        }
+    }
+}
+
+impl From<SelectionError> for Error {
+    fn from(error: SelectionError) -> Self {
+        Self::Database(error.to_string())
+    }
+}
+
+impl From<ConditionError> for Error {
+    fn from(error: ConditionError) -> Self {
+        Self::Argument(error.to_string())
+    }
+}
+
+impl From<EncodeError> for Error {
+    fn from(error: EncodeError) -> Self {
+        Self::Database(error.to_string())
+    }
+}
+
+impl From<Error> for PyErr {
+    fn from(error: Error) -> Self {
+        match error {
+            // With number and name it becomes FileNotFoundError, PermissionError and so on.
+            Error::Io(error, file) => match error.raw_os_error() {
+                Some(number) => {
+                    let text = error.to_string();
+                    let text = text.split(" (os error").next().unwrap_or_default().to_owned();
+                    PyOSError::new_err((number, text, file))
+                }
+                None if error.kind() == io::ErrorKind::Unsupported => FormatError::new_err(error.to_string()),
+                None => PyOSError::new_err(format!("{file}: {error}")),
+            },
+            Error::Format(words) => FormatError::new_err(words),
+            Error::Database(words) => DatabaseError::new_err(words),
+            Error::Device(error) => DeviceError::new_err(error.to_string()),
+            Error::Address(words) => DeviceError::new_err(words),
+            Error::Argument(words) => PyValueError::new_err(words),
+            Error::Python(error) => error,
+        }
+    }
+}
+
+/// Adds the exceptions to the module.
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    let py = module.py();
+    module.add("CantapError", py.get_type::<CantapError>())?;
+    module.add("DeviceError", py.get_type::<DeviceError>())?;
+    module.add("FormatError", py.get_type::<FormatError>())?;
+    module.add("DatabaseError", py.get_type::<DatabaseError>())?;
+    module.add("CantapWarning", py.get_type::<CantapWarning>())
+}

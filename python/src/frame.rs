@@ -1,0 +1,268 @@
+//! Frames and records, as Python has them.
+
+use cantap_trace::names::{self, BUS_ERRORS, ERROR_STATES, LOSS_STAGES, OVERTAKEN, TRANSMIT_FAILURES};
+use cantap_trace::{Direction, Frame as ClassicFrame, Id, TraceEvent, TraceFrame, TraceRecord};
+use cantap_wire::record::TransmitFailure;
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::error::Error;
+
+/// A classical CAN frame.
+#[pyclass(module = "cantap", frozen, eq, hash)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Frame(pub ClassicFrame);
+
+/// An identifier; of 29 bits if that is said, or if it is too large for 11.
+pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
+    let id = if extended.unwrap_or(raw > Id::MAX_STANDARD) { Id::extended(raw) } else { Id::standard(raw) };
+    id.ok_or_else(|| {
+        Error::argument(format!(
+            "{raw:#X} is no identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
+        ))
+    })
+}
+
+#[pymethods]
+impl Frame {
+    #[new]
+    #[pyo3(signature = (id, data=None, *, extended=None, remote=false, dlc=None))]
+    fn new(
+        id: u32,
+        data: Option<Vec<u8>>,
+        extended: Option<bool>,
+        remote: bool,
+        dlc: Option<u8>,
+    ) -> PyResult<Self> {
+        let id = identifier(id, extended)?;
+        let data = data.unwrap_or_default();
+        let wrong = |words: &str| Err(PyValueError::new_err(words.to_owned()));
+        let frame = if remote {
+            if !data.is_empty() {
+                return wrong("a remote frame has no data; give dlc, the length that it asks for");
+            }
+            ClassicFrame::remote_frame(id, dlc.unwrap_or(0))
+        } else {
+            if dlc.is_some_and(|dlc| usize::from(dlc) != data.len()) {
+                return wrong("a data frame's dlc is the number of its bytes; leave it out");
+            }
+            ClassicFrame::data_frame(id, &data)
+        };
+        match frame {
+            Some(frame) => Ok(Self(frame)),
+            None => wrong("a frame carries 0 to 8 bytes"),
+        }
+    }
+
+    /// The identifier.
+    #[getter]
+    fn id(&self) -> u32 {
+        self.0.id().raw()
+    }
+
+    /// Whether the identifier has 29 bits.
+    #[getter]
+    fn extended(&self) -> bool {
+        self.0.id().is_extended()
+    }
+
+    /// Whether it asks for data and has none.
+    #[getter]
+    fn remote(&self) -> bool {
+        self.0.is_remote()
+    }
+
+    /// The length code on the bus.
+    #[getter]
+    fn dlc(&self) -> u8 {
+        self.0.dlc()
+    }
+
+    /// The data bytes.
+    #[getter]
+    fn data<'py>(&self, py: Python<'py>) -> Bound<'py, PyBytes> {
+        PyBytes::new(py, self.0.data())
+    }
+
+    fn __str__(&self) -> String {
+        self.0.to_string()
+    }
+
+    fn __repr__(&self) -> String {
+        format!("<cantap.Frame {}>", self.0)
+    }
+
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (String,))> {
+        Ok((py.get_type::<Self>().getattr("parse")?.unbind(), (self.0.to_string(),)))
+    }
+
+    /// Reads a frame as can-utils write it: `123#1122`, `00000123#R3`.
+    #[staticmethod]
+    fn parse(text: &str) -> PyResult<Self> {
+        let frame = text.parse::<ClassicFrame>();
+        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is no frame: {error}")))
+    }
+}
+
+/// A frame, or a text that is one.
+pub struct AnyFrame(pub ClassicFrame);
+
+impl<'py> FromPyObject<'_, 'py> for AnyFrame {
+    type Error = PyErr;
+
+    fn extract(object: Borrowed<'_, 'py, PyAny>) -> PyResult<Self> {
+        if let Ok(frame) = object.cast::<Frame>() {
+            return Ok(Self(frame.get().0));
+        }
+        if let Ok(text) = object.extract::<String>() {
+            return Frame::parse(&text).map(|frame| Self(frame.0));
+        }
+        let kind = object.get_type().name()?;
+        Err(PyTypeError::new_err(format!(
+            "a cantap.Frame is wanted, or a text such as '123#1122', not {kind}"
+        )))
+    }
+}
+
+/// What happened on a bus: a frame, an error, a loss.
+#[pyclass(module = "cantap", frozen, eq, hash)]
+#[derive(Clone, Copy, PartialEq, Eq, Hash)]
+pub struct Record(pub TraceRecord);
+
+impl Record {
+    fn frame(&self) -> Option<&TraceFrame> {
+        self.0.frame()
+    }
+}
+
+#[pymethods]
+impl Record {
+    /// Seconds since 1970, UTC.
+    #[getter]
+    fn time_s(&self) -> f64 {
+        self.0.time_ns as f64 / 1e9
+    }
+
+    /// Nanoseconds since 1970, UTC. Of a frame it is the end.
+    #[getter]
+    fn time_ns(&self) -> i64 {
+        self.0.time_ns
+    }
+
+    /// The channel, from 1.
+    #[getter]
+    fn channel(&self) -> u8 {
+        self.0.channel
+    }
+
+    /// What happened: `frame`, `lost`, `bus-error`, `errors-suppressed`, `state`, `transmit-failed`.
+    #[getter]
+    fn event(&self) -> &'static str {
+        match self.0.event {
+            TraceEvent::Frame { .. } => "frame",
+            TraceEvent::Lost { .. } => "lost",
+            TraceEvent::BusError { .. } => "bus-error",
+            TraceEvent::ErrorsSuppressed { .. } => "errors-suppressed",
+            TraceEvent::State { .. } => "state",
+            TraceEvent::TransmitFailed { .. } => "transmit-failed",
+        }
+    }
+
+    /// Where frames were lost, which error, which state, why not sent.
+    #[getter]
+    fn detail(&self) -> Option<&'static str> {
+        match &self.0.event {
+            TraceEvent::Lost { stage, .. } => stage.map(|stage| names::name(&LOSS_STAGES, &stage)),
+            TraceEvent::BusError { kind, .. } => kind.map(|kind| names::name(&BUS_ERRORS, &kind)),
+            TraceEvent::State { state, .. } => Some(names::name(&ERROR_STATES, state)),
+            TraceEvent::TransmitFailed { reason, .. } => Some(failure(*reason)),
+            TraceEvent::Frame { .. } | TraceEvent::ErrorsSuppressed { .. } => None,
+        }
+    }
+
+    /// Frames lost, errors suppressed, periods that passed.
+    #[getter]
+    fn count(&self) -> Option<u32> {
+        match self.0.event {
+            TraceEvent::Lost { count, .. } | TraceEvent::ErrorsSuppressed { count } => Some(count),
+            TraceEvent::TransmitFailed { reason: TransmitFailure::Overtaken { periods }, .. } => {
+                Some(periods)
+            }
+            _ => None,
+        }
+    }
+
+    /// Whether more may have been lost.
+    #[getter]
+    fn at_least(&self) -> bool {
+        matches!(self.0.event, TraceEvent::Lost { at_least: true, .. })
+    }
+
+    /// The frame's identifier.
+    #[getter]
+    fn id(&self) -> Option<u32> {
+        self.frame().map(|frame| frame.id().raw())
+    }
+
+    /// Whether it has 29 bits.
+    #[getter]
+    fn extended(&self) -> bool {
+        self.frame().is_some_and(|frame| frame.id().is_extended())
+    }
+
+    /// Whether the frame asks for data and has none.
+    #[getter]
+    fn remote(&self) -> bool {
+        self.frame().is_some_and(TraceFrame::is_remote)
+    }
+
+    /// The frame's length code on the bus.
+    #[getter]
+    fn dlc(&self) -> Option<u8> {
+        self.frame().map(TraceFrame::dlc)
+    }
+
+    /// The frame's data bytes.
+    #[getter]
+    fn data<'py>(&self, py: Python<'py>) -> Option<Bound<'py, PyBytes>> {
+        self.frame().map(|frame| PyBytes::new(py, frame.data()))
+    }
+
+    /// `rx` or `tx`, of a frame.
+    #[getter]
+    fn direction(&self) -> Option<&'static str> {
+        match self.0.event {
+            TraceEvent::Frame { direction: Direction::Tx, .. } => Some("tx"),
+            TraceEvent::Frame { .. } => Some("rx"),
+            _ => None,
+        }
+    }
+
+    /// Whether the frame ended then or earlier.
+    #[getter]
+    fn late(&self) -> bool {
+        matches!(self.0.event, TraceEvent::Frame { late: true, .. })
+    }
+
+    fn __repr__(&self) -> String {
+        let TraceRecord { time_ns, channel, .. } = self.0;
+        let seconds = format!("{}.{:06}", time_ns / 1_000_000_000, time_ns / 1000 % 1_000_000);
+        match self.frame() {
+            Some(frame) => format!("<cantap.Record {seconds} channel {channel} {frame}>"),
+            None => {
+                let detail = self.detail().map_or_else(String::new, |detail| format!(" {detail}"));
+                let count = self.count().map_or_else(String::new, |count| format!(" {count}"));
+                format!("<cantap.Record {seconds} channel {channel} {}{detail}{count}>", self.event())
+            }
+        }
+    }
+}
+
+/// A reason's name.
+pub fn failure(reason: TransmitFailure) -> &'static str {
+    match reason {
+        TransmitFailure::Overtaken { .. } => OVERTAKEN,
+        reason => names::name(&TRANSMIT_FAILURES, &reason),
+    }
+}

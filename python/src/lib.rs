@@ -1,0 +1,28 @@
+//! The compiled half of the package `cantap` for Python. `cantap/` beside it is what Python sees.
+
+#![deny(unsafe_op_in_unsafe_fn)]
+
+mod database;
+mod device;
+mod error;
+mod frame;
+mod report;
+mod scan;
+mod source;
+mod table;
+
+use pyo3::prelude::*;
+
+/// Devices, trace files and signals, for the package `cantap`.
+#[pymodule]
+fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    error::register(module)?;
+    module.add_class::<database::Database>()?;
+    module.add_class::<frame::Frame>()?;
+    module.add_class::<frame::Record>()?;
+    module.add_class::<report::Report>()?;
+    device::register(module)?;
+    module.add_class::<scan::Scan>()?;
+    module.add_class::<table::Table>()?;
+    module.add("__version__", env!("CARGO_PKG_VERSION"))
+}

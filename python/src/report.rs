@@ -1,0 +1,248 @@
+//! What became of a file: what was read of it, and what was not.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use cantap_formats::{Fault, LeftOut, ReadIssue, TraceReader};
+use cantap_trace::{TraceEvent, TraceRecord};
+use pyo3::prelude::*;
+use serde::{Deserialize, Serialize};
+
+/// Faults are kept in words until it is clear that the whole file is one.
+const FAULTS_KEPT: usize = 20;
+
+/// The numbers.
+#[derive(Clone, Debug, Default, Serialize, Deserialize)]
+pub struct Counts {
+    pub file: String,
+    pub format: String,
+    pub records_read: u64,
+    pub records: u64,
+    pub frames: u64,
+    pub lost: u64,
+    pub lost_at_least: bool,
+    pub bus_errors: u64,
+    pub decoded: u64,
+    pub values: u64,
+    pub issues: u64,
+    pub is_cut: bool,
+    pub faults: Vec<String>,
+    pub left_out: BTreeMap<String, u64>,
+    pub notes: BTreeMap<String, u64>,
+    pub is_whole: bool,
+}
+
+impl Counts {
+    /// Counts a record that is handed on.
+    pub fn count(&mut self, record: &TraceRecord) {
+        self.records += 1;
+        match record.event {
+            TraceEvent::Frame { .. } => self.frames += 1,
+            TraceEvent::Lost { count, at_least, .. } => {
+                self.lost += u64::from(count);
+                self.lost_at_least |= at_least;
+            }
+            TraceEvent::BusError { .. } => self.bus_errors += 1,
+            TraceEvent::ErrorsSuppressed { count } => self.bus_errors += u64::from(count),
+            TraceEvent::State { .. } | TraceEvent::TransmitFailed { .. } => {}
+        }
+    }
+
+    /// Counts what could not be read.
+    pub fn fault(&mut self, issue: &ReadIssue) {
+        self.issues += 1;
+        self.is_cut |= matches!(issue.fault, Fault::Truncated(_));
+        if self.faults.len() < FAULTS_KEPT {
+            self.faults.push(issue.to_string());
+        }
+    }
+
+    /// Takes over what the reader knows by now.
+    pub fn update(&mut self, reader: &TraceReader) {
+        self.records_read = reader.records();
+        self.left_out = by_kind(reader.left_out());
+        self.notes = by_kind(reader.notes());
+    }
+
+    /// The share of the file's entries that is missing, in per cent; an issue counts as one.
+    pub fn missing_pct(&self) -> f64 {
+        let missing = self.issues + self.left_out.values().sum::<u64>();
+        missing as f64 * 100.0 / (self.records_read + missing).max(1) as f64
+    }
+
+    /// What is wrong with the file, in words, if anything is.
+    pub fn warning(&self) -> Option<String> {
+        let first = self.faults.first()?;
+        let more = self.issues - 1;
+        let share = self.missing_pct();
+        let others = match more {
+            0 => String::new(),
+            1 => ", and 1 more place".to_owned(),
+            more => format!(", and {more} more places"),
+        };
+        Some(format!("{first}{others}; {share:.2} % of the file could not be read (see the table's report)"))
+    }
+}
+
+/// Descriptions and counts.
+pub fn by_kind(counts: &LeftOut) -> BTreeMap<String, u64> {
+    counts.iter().map(|(what, count)| (what.to_owned(), count)).collect()
+}
+
+/// What was read of a file, and what could not be.
+#[pyclass(module = "cantap", frozen)]
+#[derive(Clone, Default)]
+pub struct Report(pub Arc<Mutex<Counts>>);
+
+impl Report {
+    /// As it is now.
+    pub fn now(&self) -> Counts {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Replaces it.
+    pub fn set(&self, counts: Counts) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = counts;
+    }
+}
+
+#[pymethods]
+impl Report {
+    /// The file's name, as it was given.
+    #[getter]
+    fn file(&self) -> String {
+        self.now().file
+    }
+
+    /// The format that it was read as.
+    #[getter]
+    fn format(&self) -> String {
+        self.now().format
+    }
+
+    /// Records that the file had, before any filter.
+    #[getter]
+    fn records_read(&self) -> u64 {
+        self.now().records_read
+    }
+
+    /// Records that passed the filters.
+    #[getter]
+    fn records(&self) -> u64 {
+        self.now().records
+    }
+
+    /// Frames among them.
+    #[getter]
+    fn frames(&self) -> u64 {
+        self.now().frames
+    }
+
+    /// Frames that the trace says are missing in it.
+    #[getter]
+    fn lost(&self) -> u64 {
+        self.now().lost
+    }
+
+    /// Whether there may be more missing than `lost`.
+    #[getter]
+    fn lost_at_least(&self) -> bool {
+        self.now().lost_at_least
+    }
+
+    /// Bus errors, with those that were only counted.
+    #[getter]
+    fn bus_errors(&self) -> u64 {
+        self.now().bus_errors
+    }
+
+    /// Frames that a database had a message for.
+    #[getter]
+    fn decoded(&self) -> u64 {
+        self.now().decoded
+    }
+
+    /// Values in them.
+    #[getter]
+    fn values(&self) -> u64 {
+        self.now().values
+    }
+
+    /// Places that could not be read.
+    #[getter]
+    fn issues(&self) -> u64 {
+        self.now().issues
+    }
+
+    /// The first of them, in words.
+    #[getter]
+    fn faults(&self) -> Vec<String> {
+        self.now().faults
+    }
+
+    /// Whether the file ends in the middle of something.
+    #[getter]
+    fn is_cut(&self) -> bool {
+        self.now().is_cut
+    }
+
+    /// What is well-formed and no part of a CAN trace, by kind.
+    #[getter]
+    fn left_out(&self) -> BTreeMap<String, u64> {
+        self.now().left_out
+    }
+
+    /// What is nothing wrong and should be known all the same, by kind.
+    #[getter]
+    fn notes(&self) -> BTreeMap<String, u64> {
+        self.now().notes
+    }
+
+    /// The share of the file's entries that could not be read or are left out, in per cent.
+    #[getter]
+    fn missing_pct(&self) -> f64 {
+        self.now().missing_pct()
+    }
+
+    /// Whether the file was read to its end and nothing of it is missing here.
+    #[getter]
+    fn is_whole(&self) -> bool {
+        let counts = self.now();
+        counts.is_whole && counts.issues == 0
+    }
+
+    /// All of it.
+    fn to_dict<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
+        let counts = self.now();
+        let mut object = serde_json::to_value(&counts).unwrap_or_default();
+        object["missing_pct"] = counts.missing_pct().into();
+        object["is_whole"] = self.is_whole().into();
+        from_json(py, &object.to_string())
+    }
+
+    fn __repr__(&self) -> String {
+        let Counts { file, format, records, frames, lost, issues, .. } = self.now();
+        let state = if self.is_whole() { "whole" } else { "not whole" };
+        format!(
+            "<cantap.Report of {file} ({format}): {records} records, {frames} frames, {lost} lost, {issues} issues, {state}>"
+        )
+    }
+
+    fn __reduce__(&self, py: Python<'_>) -> PyResult<(Py<PyAny>, (String,))> {
+        let make = py.get_type::<Self>().getattr("_from_json")?.unbind();
+        Ok((make, (serde_json::to_string(&self.now()).unwrap_or_default(),)))
+    }
+
+    #[staticmethod]
+    fn _from_json(text: &str) -> PyResult<Self> {
+        let counts = serde_json::from_str(text);
+        let counts: Counts =
+            counts.map_err(|error| pyo3::exceptions::PyValueError::new_err(error.to_string()))?;
+        Ok(Self(Arc::new(Mutex::new(counts))))
+    }
+}
+
+/// What a JSON text says, as Python's own objects.
+pub fn from_json<'py>(py: Python<'py>, text: &str) -> PyResult<Bound<'py, PyAny>> {
+    py.import("json")?.call_method1("loads", (text,))
+}

@@ -1,0 +1,143 @@
+//! The records of a trace file that were asked for.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use cantap_formats::time_range::{TimePoint, TimeRange};
+use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone, open_reader};
+use cantap_signals::Decoder;
+use cantap_trace::TraceRecord;
+use cantap_trace::filter::Filter;
+use pyo3::prelude::*;
+
+use crate::database::Database;
+use crate::error::Error;
+use crate::report::{Counts, Report};
+
+/// What to read of a file, as Python's half hands it over.
+#[derive(FromPyObject)]
+#[pyo3(from_item_all)]
+pub struct Options {
+    pub path: PathBuf,
+    pub format: Option<String>,
+    pub zone: Option<String>,
+    pub strict: bool,
+    pub filters: Vec<String>,
+    pub channels: Vec<u8>,
+    pub start: Option<String>,
+    pub end: Option<String>,
+    pub db: Option<Py<Database>>,
+    pub signals: Vec<String>,
+}
+
+impl Options {
+    /// What decodes, if a database was given.
+    pub fn decoder(&self) -> Result<Option<Arc<Decoder>>, Error> {
+        match &self.db {
+            Some(database) => database.get().selecting(&self.signals).map(Some),
+            None if self.signals.is_empty() => Ok(None),
+            None => Err(Error::argument("signals are chosen out of a database; give one with db=")),
+        }
+    }
+
+    fn read(&self) -> Result<ReadOptions, Error> {
+        let format = self.format.as_deref().map(str::parse::<Format>).transpose().map_err(Error::argument)?;
+        let zone = self.zone.as_deref().map(str::parse::<Zone>).transpose().map_err(Error::argument)?;
+        Ok(ReadOptions {
+            format,
+            strict: self.strict,
+            zone: zone.unwrap_or_default(),
+            ..ReadOptions::default()
+        })
+    }
+}
+
+/// A file being read.
+pub struct TraceSource {
+    reader: TraceReader,
+    strict: bool,
+    filters: Vec<Filter>,
+    channels: Vec<u8>,
+    window: TimeRange,
+    is_all: bool,
+    pub counts: Counts,
+    report: Report,
+}
+
+impl TraceSource {
+    /// Opens the file. How it goes is told to the report.
+    pub fn open(options: &Options, report: Report) -> Result<Self, Error> {
+        let read = options.read()?;
+        let filters =
+            options.filters.iter().map(|text| text.parse::<Filter>()).collect::<Result<Vec<_>, _>>();
+        let point = |text: &Option<String>| text.as_deref().map(str::parse::<TimePoint>).transpose();
+        let start = point(&options.start).map_err(Error::argument)?;
+        let end = point(&options.end).map_err(Error::argument)?;
+        if options.channels.contains(&0) {
+            return Err(Error::argument("channels count from 1"));
+        }
+        let filters = filters.map_err(Error::argument)?;
+        let reader = open_reader(&options.path, &read)?;
+        let counts = Counts {
+            file: options.path.display().to_string(),
+            format: reader.format().to_string(),
+            ..Counts::default()
+        };
+        report.set(counts.clone());
+        let is_all = filters.is_empty() && options.channels.is_empty() && start.is_none() && end.is_none();
+        let window = TimeRange::new(start, end);
+        let channels = options.channels.clone();
+        Ok(Self { reader, strict: options.strict, filters, channels, window, is_all, counts, report })
+    }
+
+    /// Puts the next records in the place of what is in `records`, perhaps none; false at the end.
+    pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Result<bool, Error> {
+        loop {
+            match self.reader.next_batch(records) {
+                None => break,
+                Some(Ok(())) => {
+                    self.choose(records);
+                    for record in records.iter() {
+                        self.counts.count(record);
+                    }
+                    return Ok(true);
+                }
+                Some(Err(issue)) => {
+                    self.counts.fault(&issue);
+                    // Of a file that the system stops to deliver nobody may think that this was all.
+                    if self.strict || matches!(issue.fault, Fault::Io(_)) {
+                        self.tell();
+                        return Err(issue.into());
+                    }
+                }
+            }
+        }
+        records.clear();
+        self.counts.is_whole = true;
+        self.tell();
+        match self.reader.nothing_read() {
+            Some(nothing) => Err(nothing.into()),
+            None => Ok(false),
+        }
+    }
+
+    /// Brings the report up to date.
+    pub fn tell(&mut self) {
+        self.counts.update(&self.reader);
+        self.report.set(self.counts.clone());
+    }
+
+    fn choose(&mut self, records: &mut Vec<TraceRecord>) {
+        if self.is_all {
+            return;
+        }
+        let Self { filters, channels, window, .. } = self;
+        records.retain(|record| {
+            // The window's first record is the trace's, whatever the channel.
+            let inside = window.contains(record);
+            inside
+                && (channels.is_empty() || channels.contains(&record.channel))
+                && (filters.is_empty() || filters.iter().any(|filter| filter.accepts(record)))
+        });
+    }
+}

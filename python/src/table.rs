@@ -1,0 +1,207 @@
+//! Tables that any Arrow program takes without copying, through the PyCapsule interface.
+//!
+//! <https://arrow.apache.org/docs/format/CDataInterface/PyCapsuleInterface.html>
+
+use std::ffi::CStr;
+use std::sync::Arc;
+
+use arrow_array::ffi::FFI_ArrowSchema;
+use arrow_array::ffi_stream::{FFI_ArrowArrayStream, RecordBatchStreamReader};
+use arrow_array::{Array, RecordBatch, RecordBatchIterator, RecordBatchReader, StructArray};
+use arrow_ipc::reader::StreamReader;
+use arrow_ipc::writer::StreamWriter;
+use arrow_schema::{ArrowError, SchemaRef};
+use pyo3::exceptions::{PyTypeError, PyValueError};
+use pyo3::prelude::*;
+use pyo3::types::{PyBytes, PyCapsule, PyDict, PyTuple};
+
+use crate::error::FormatError;
+use crate::report::Report;
+
+const STREAM: &CStr = c"arrow_array_stream";
+const SCHEMA: &CStr = c"arrow_schema";
+const ARRAY: &CStr = c"arrow_array";
+
+/// A table in memory, in one or several batches.
+#[pyclass(module = "cantap", frozen)]
+pub struct Table {
+    schema: SchemaRef,
+    batches: Vec<RecordBatch>,
+    report: Option<Py<Report>>,
+}
+
+fn arrow_error(error: ArrowError) -> PyErr {
+    FormatError::new_err(error.to_string())
+}
+
+impl Table {
+    /// Of batches that have this schema, and what is to be said about their source.
+    pub fn new(schema: SchemaRef, batches: Vec<RecordBatch>, report: Option<Py<Report>>) -> Self {
+        Self { schema, batches, report }
+    }
+
+    /// One batch.
+    pub fn of_batch(batch: RecordBatch) -> Self {
+        Self { schema: batch.schema(), batches: vec![batch], report: None }
+    }
+
+    fn rows(&self) -> usize {
+        self.batches.iter().map(RecordBatch::num_rows).sum()
+    }
+}
+
+#[pymethods]
+impl Table {
+    /// How many rows there are.
+    #[getter]
+    fn num_rows(&self) -> usize {
+        self.rows()
+    }
+
+    /// The columns' names, in order.
+    #[getter]
+    fn column_names<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyTuple>> {
+        PyTuple::new(py, self.schema.fields().iter().map(|field| field.name()))
+    }
+
+    /// What is known about a column beside its values: its unit, its description.
+    fn column_metadata<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Bound<'py, PyDict>> {
+        let field = self.schema.field_with_name(name).map_err(|_| self.no_column(name))?;
+        let about = PyDict::new(py);
+        for (key, value) in field.metadata() {
+            about.set_item(key, value)?;
+        }
+        Ok(about)
+    }
+
+    /// What is known about the table beside its columns: of which message it is, for example.
+    #[getter]
+    fn metadata<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyDict>> {
+        let about = PyDict::new(py);
+        for (key, value) in self.schema.metadata() {
+            about.set_item(key, value)?;
+        }
+        Ok(about)
+    }
+
+    /// What was read, and what could not be; `None` for a table that came from nowhere else.
+    #[getter]
+    fn report(&self, py: Python<'_>) -> Option<Py<Report>> {
+        self.report.as_ref().map(|report| report.clone_ref(py))
+    }
+
+    /// The batches, each a table.
+    fn batches(&self) -> Vec<Self> {
+        self.batches.iter().cloned().map(Self::of_batch).collect()
+    }
+
+    fn __len__(&self) -> usize {
+        self.rows()
+    }
+
+    fn __repr__(&self) -> String {
+        let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).collect();
+        format!("<cantap.Table of {} rows: {}>", self.rows(), names.join(", "))
+    }
+
+    fn __arrow_c_schema__<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyCapsule>> {
+        schema_capsule(py, &self.schema)
+    }
+
+    #[pyo3(signature = (requested_schema=None))]
+    fn __arrow_c_stream__<'py>(
+        &self,
+        py: Python<'py>,
+        requested_schema: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<Bound<'py, PyCapsule>> {
+        // Whoever asks for other types casts: the interface leaves it open.
+        drop(requested_schema);
+        let batches = self.batches.clone().into_iter().map(Ok);
+        stream_capsule(py, Box::new(RecordBatchIterator::new(batches, Arc::clone(&self.schema))))
+    }
+
+    #[pyo3(signature = (requested_schema=None))]
+    fn __arrow_c_array__<'py>(
+        &self,
+        py: Python<'py>,
+        requested_schema: Option<Bound<'py, PyAny>>,
+    ) -> PyResult<(Bound<'py, PyCapsule>, Bound<'py, PyCapsule>)> {
+        drop(requested_schema);
+        let batch = self.one_batch()?;
+        let (array, _) =
+            arrow_array::ffi::to_ffi(&StructArray::from(batch).to_data()).map_err(arrow_error)?;
+        Ok((self.__arrow_c_schema__(py)?, PyCapsule::new_with_value(py, array, ARRAY)?))
+    }
+
+    fn __reduce__<'py>(
+        &self,
+        py: Python<'py>,
+    ) -> PyResult<(Py<PyAny>, (Bound<'py, PyBytes>, Option<Py<Report>>))> {
+        let written = py.detach(|| {
+            let mut writer = StreamWriter::try_new(Vec::new(), &self.schema)?;
+            self.batches.iter().try_for_each(|batch| writer.write(batch))?;
+            writer.into_inner()
+        });
+        let bytes = PyBytes::new(py, &written.map_err(arrow_error)?);
+        let make = py.get_type::<Self>().getattr("_from_ipc")?.unbind();
+        Ok((make, (bytes, self.report(py))))
+    }
+
+    #[staticmethod]
+    fn _from_ipc(bytes: &[u8], report: Option<Py<Report>>) -> PyResult<Self> {
+        let reader = StreamReader::try_new(bytes, None).map_err(arrow_error)?;
+        let schema = reader.schema();
+        let batches = reader.collect::<Result<_, _>>().map_err(arrow_error)?;
+        Ok(Self { schema, batches, report })
+    }
+}
+
+impl Table {
+    fn no_column(&self, name: &str) -> PyErr {
+        let names: Vec<_> = self.schema.fields().iter().map(|field| field.name().as_str()).collect();
+        PyValueError::new_err(format!("there is no column '{name}'; there are {}", names.join(", ")))
+    }
+
+    /// All rows in one piece; nothing is copied if they are already.
+    pub fn one_batch(&self) -> PyResult<RecordBatch> {
+        match self.batches.as_slice() {
+            [batch] => Ok(batch.clone()),
+            batches => arrow_select::concat::concat_batches(&self.schema, batches).map_err(arrow_error),
+        }
+    }
+}
+
+/// The columns, for whoever takes them.
+pub fn schema_capsule<'py>(py: Python<'py>, schema: &SchemaRef) -> PyResult<Bound<'py, PyCapsule>> {
+    let schema = FFI_ArrowSchema::try_from(schema.as_ref()).map_err(arrow_error)?;
+    PyCapsule::new_with_value(py, schema, SCHEMA)
+}
+
+/// A stream of batches, for whoever takes it.
+pub fn stream_capsule(
+    py: Python<'_>,
+    reader: Box<dyn RecordBatchReader + Send>,
+) -> PyResult<Bound<'_, PyCapsule>> {
+    PyCapsule::new_with_value(py, FFI_ArrowArrayStream::new(reader), STREAM)
+}
+
+/// The batches of whatever has some: a table of this package, of pyarrow, pandas, Polars, DuckDB.
+pub fn batches_of(object: &Bound<'_, PyAny>) -> PyResult<Box<dyn RecordBatchReader + Send>> {
+    if let Ok(table) = object.cast::<Table>() {
+        let table = table.get();
+        let batches = table.batches.clone().into_iter().map(Ok);
+        return Ok(Box::new(RecordBatchIterator::new(batches, Arc::clone(&table.schema))));
+    }
+    let Ok(export) = object.getattr("__arrow_c_stream__") else {
+        let kind = object.get_type().name()?;
+        return Err(PyTypeError::new_err(format!(
+            "a table is wanted, of this package or of pyarrow, pandas, Polars or DuckDB; this is of type {kind}"
+        )));
+    };
+    let capsule = export.call0()?.cast_into::<PyCapsule>()?;
+    let pointer = capsule.pointer_checked(Some(STREAM))?.cast::<FFI_ArrowArrayStream>();
+    // SAFETY: the name says that the capsule has an initialised stream, which the interface lets its one consumer take. What
+    // is left behind is marked as released, which the capsule's destructor looks at.
+    let reader = unsafe { RecordBatchStreamReader::from_raw(pointer.as_ptr()) };
+    Ok(Box::new(reader.map_err(arrow_error)?))
+}

@@ -1,0 +1,85 @@
+"""Lets python-can's own tests run on the analyser: a pytest plugin that puts it in the place of python-can's virtual interface.
+
+Those tests open two buses of one name, which see each other: here they are the two channels of a virtual device on one bus. Each name is
+a device. They look at details of python-can's virtual interface and of its threads, which are added here and are no part of the plugin:
+how many messages wait (`queue`), and the thread of a periodic task (`thread`).
+"""
+
+import collections
+import threading
+
+import can
+from cantap.can_bus import CantapBus, DeviceCyclicTask
+
+_in_use = collections.defaultdict(set)
+_lock = threading.Lock()
+
+
+class Queue:
+    """What of a message queue these tests ask for."""
+
+    def __init__(self, bus):
+        self._bus = bus
+
+    def qsize(self):
+        """How many messages wait."""
+        while (message := self._bus._take(0)) is not None:
+            self._bus.waiting.append(message)
+        return len(self._bus.waiting)
+
+    def empty(self):
+        """Whether none does."""
+        return self.qsize() == 0
+
+
+class Bus(CantapBus):
+    """As python-can's virtual interface is opened."""
+
+    def __init__(self, channel=None, bitrate=500_000, receive_own_messages=False, **kwargs):
+        self.name = channel
+        self.waiting = collections.deque()
+        self.queue = Queue(self)
+        with _lock:
+            self.taken = next(number for number in (1, 2) if number not in _in_use[channel])
+            _in_use[channel].add(self.taken)
+        serial = "".join(letter for letter in str(channel) if letter.isalnum())
+        # Before anything can fail.
+        self._periodic_tasks = []
+        for option in ("fd", "single_handle", "preserve_timestamps", "rx_queue_size", "interface"):
+            kwargs.pop(option, None)
+        super().__init__(
+            f"virtual:load=0,wire=joined,serial={serial or 'none'}:{self.taken}",
+            bitrate=bitrate,
+            receive_own_messages=receive_own_messages,
+            **kwargs,
+        )
+
+    def _take(self, timeout):
+        message, _ = super()._recv_internal(timeout)
+        if message is not None:
+            message.channel = self.name
+        return message
+
+    def _recv_internal(self, timeout):
+        if self.waiting:
+            return self.waiting.popleft(), True
+        return self._take(timeout), True
+
+    def shutdown(self):
+        if not self._is_shutdown:
+            super().shutdown()
+            with _lock:
+                _in_use[self.name].discard(self.taken)
+
+
+can.interfaces.BACKENDS["virtual"] = (__name__, "Bus")
+# The analyser has no CAN FD.
+DeviceCyclicTask.thread = threading.Thread(target=lambda: None)
+DeviceCyclicTask.thread.start()
+
+
+def pytest_collection_modifyitems(config, items):
+    """CAN FD is what the analyser does not have."""
+    kept = [item for item in items if "_fd" not in item.name]
+    config.hook.pytest_deselected(items=[item for item in items if item not in kept])
+    items[:] = kept

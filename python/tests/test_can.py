@@ -1,0 +1,210 @@
+"""The interface `cantap` of python-can."""
+
+import asyncio
+import struct
+import time
+
+import pytest
+
+can = pytest.importorskip("can")
+
+QUIET = "virtual:load=0,wire=joined"
+
+
+@pytest.fixture
+def pair():
+    with (
+        can.Bus(interface="cantap", channel=f"{QUIET}:1", bitrate=500_000) as first,
+        can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000) as second,
+    ):
+        yield first, second
+
+
+def message(identifier=0x123, data=b"\x01\x02", **options):
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=identifier > 0x7FF, **options)
+
+
+def test_two_channels_share_a_session(pair):
+    first, second = pair
+    assert first.device is second.device
+    first.send(message())
+    heard = second.recv(1)
+    assert heard.arbitration_id == 0x123 and bytes(heard.data) == b"\x01\x02" and heard.channel == 1
+    assert abs(heard.timestamp - time.time()) < 1
+    assert heard.is_rx and not heard.is_error_frame
+    second.shutdown()
+    first.send(message(), timeout=1)
+    assert first.losses()["lost"] == 0 and first.losses()["received"] == 0
+    first.shutdown()
+    first.shutdown()
+    assert first.device.closed
+
+
+def test_send_waits_for_the_bus_if_asked_to():
+    with can.Bus(interface="cantap", channel="virtual:load=0,ack=no", bitrate=500_000) as bus:
+        bus.send(message())
+        with pytest.raises(can.CanOperationError, match="taken back"):
+            bus.send(message(), timeout=0.3)
+
+
+def test_own_messages_come_if_asked_for():
+    with can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, receive_own_messages=True) as bus:
+        bus.send(message())
+        own = bus.recv(1)
+        assert own.arbitration_id == 0x123 and not own.is_rx
+    with can.Bus(interface="cantap", channel=QUIET, bitrate=500_000) as bus:
+        bus.send(message(), timeout=1)
+        assert bus.recv(0.1) is None
+
+
+def test_filters_hold_from_the_first_message_on_and_can_be_changed(pair):
+    first, _ = pair
+    filters = [
+        {"can_id": 0x100, "can_mask": 0x700, "extended": False},
+        {"can_id": 0x1ABCDE00, "can_mask": 0x1FFFFFFF, "extended": True},
+    ]
+    with can.Bus(interface="cantap", channel=f"{QUIET}:2", bitrate=500_000, can_filters=filters) as bus:
+        for identifier in (0x123, 0x223, 0x1ABCDE00, 0x1ABCDE01, 0x1FF):
+            first.send(message(identifier), timeout=1)
+        assert [bus.recv(1).arbitration_id for _ in range(3)] == [0x123, 0x1ABCDE00, 0x1FF]
+        assert bus.recv(0.05) is None
+        bus.set_filters([{"can_id": 0x223, "can_mask": 0x7FF}])
+        first.send(message(0x123), timeout=1)
+        first.send(message(0x223), timeout=1)
+        assert bus.recv(1).arbitration_id == 0x223
+        bus.set_filters(None)
+        first.send(message(0x321), timeout=1)
+        assert bus.recv(1).arbitration_id == 0x321
+
+
+def test_a_filter_that_no_identifier_passes_lets_none_pass(pair):
+    first, second = pair
+    second.set_filters([{"can_id": 0x10000, "can_mask": 0x1FFFFFFF, "extended": False}])
+    first.send(message(), timeout=1)
+    assert second.recv(0.1) is None
+
+
+def test_errors_are_error_frames_as_socketcan_has_them():
+    with can.Bus(interface="cantap", channel="virtual:load=50,errors=20", bitrate=500_000, listen_only=True) as bus:
+        errors = [found for found in (bus.recv(1) for _ in range(2000)) if found.is_error_frame]
+    assert errors and all(error.dlc == 8 for error in errors)
+    # linux/can/error.h: 0x80 is a bus error, 0x04 a problem of the controller.
+    assert any(error.arbitration_id & 0x80 for error in errors)
+
+
+def test_a_loss_is_an_error_frame_and_is_counted():
+    with can.Bus(
+        interface="cantap", channel="virtual:load=80", bitrate=500_000, listen_only=True, rx_capacity=50
+    ) as bus:
+        time.sleep(0.5)
+        lost, frames = 0, 0
+        for _ in range(400):
+            found = bus.recv(1)
+            if found.is_error_frame and found.arbitration_id & 0x04 and found.data[1] == 0x01:
+                lost += struct.unpack_from("<I", found.data, 2)[0]
+            frames += not found.is_error_frame
+        counts = bus.losses()
+    assert lost > 0 and counts["bus"] >= lost and counts["lost"] == counts["bus"] and frames > 300
+
+
+def test_periodic_messages_are_sent_by_the_devices_timer(pair):
+    first, second = pair
+    task = first.send_periodic(message(0x200, b"\x00"), 0.01)
+    assert type(task).__name__ == "DeviceCyclicTask"
+    times = [second.recv(1).timestamp for _ in range(30)]
+    gaps = [after - before for before, after in zip(times, times[1:])]
+    assert all(0.0099 < gap < 0.0101 for gap in gaps)
+    task.modify_data(message(0x200, b"\x55"))
+    assert any(bytes(second.recv(1).data) == b"\x55" for _ in range(10))
+    with pytest.raises(ValueError):
+        task.modify_data(message(0x201, b"\x55"))
+    task.stop()
+    time.sleep(0.05)
+    while second.recv(0):
+        pass
+    assert second.recv(0.1) is None
+    task.start()
+    assert second.recv(1) is not None
+
+
+def test_a_limited_task_sends_as_often_as_it_lasts(pair):
+    first, second = pair
+    first.send_periodic(message(), 0.01, duration=0.2)
+    assert sum(second.recv(0.1) is not None for _ in range(40)) == 20
+
+
+def test_what_the_device_cannot_repeat_a_thread_does(pair):
+    first, second = pair
+    task = first.send_periodic([message(data=b"\x01"), message(data=b"\x02")], 0.01)
+    assert isinstance(task, can.broadcastmanager.ThreadBasedCyclicSendTask)
+    assert {bytes(second.recv(1).data) for _ in range(6)} == {b"\x01", b"\x02"}
+    task.stop()
+    many = [first.send_periodic(message(), 10) for _ in range(40)]
+    kinds = {type(one).__name__ for one in many}
+    assert kinds == {"DeviceCyclicTask", "ThreadBasedCyclicSendTask"}
+
+
+def test_the_state_is_the_controllers():
+    with can.Bus(interface="cantap", channel=QUIET, bitrate=500_000) as bus:
+        assert bus.state is can.BusState.ACTIVE
+        bus.state = can.BusState.PASSIVE
+        assert bus.state is can.BusState.PASSIVE
+        with pytest.raises(can.CanOperationError, match="only listens"):
+            bus.send(message())
+        bus.state = can.BusState.ACTIVE
+        bus.send(message(), timeout=1)
+        with pytest.raises(ValueError):
+            bus.state = can.BusState.ERROR
+    with can.Bus(interface="cantap", channel="virtual:load=0,disturb=100", bitrate=500_000, manual_recovery=True) as bus:
+        with pytest.raises(can.CanOperationError):
+            bus.send(message(), timeout=2)
+        assert bus.state is can.BusState.ERROR
+
+
+def test_timing_can_be_given_in_segments():
+    timing = can.BitTiming.from_sample_point(f_clock=8_000_000, bitrate=250_000, sample_point=75)
+    with can.Bus(interface="cantap", channel=QUIET, timing=timing) as bus:
+        assert bus.device.channels[1]["bitrate"] == 250_000
+
+
+def test_asyncio_waits_for_the_file_descriptor(pair):
+    first, second = pair
+
+    async def run():
+        reader = can.AsyncBufferedReader()
+        notifier = can.Notifier(second, [reader], loop=asyncio.get_running_loop())
+        for identifier in range(300):
+            first.send(message(identifier))
+        found = [(await asyncio.wait_for(reader.get_message(), 5)).arbitration_id for _ in range(300)]
+        notifier.stop()
+        return found
+
+    assert asyncio.run(run()) == list(range(300))
+
+
+def test_boards_are_detected():
+    assert isinstance(can.detect_available_configs("cantap"), list)
+
+
+def test_what_cannot_be_opened_or_sent_is_an_error_of_python_can(pair):
+    first, _ = pair
+    with pytest.raises(can.CanInitializationError):
+        can.Bus(interface="cantap", channel="/dev/no-such-port:1", bitrate=500_000)
+    with pytest.raises(can.CanInitializationError, match="500000"):
+        can.Bus(interface="cantap", channel=f"{QUIET}:1", bitrate=250_000)
+    with pytest.raises(can.CanInitializationError, match="FD"):
+        can.Bus(interface="cantap", channel=QUIET, bitrate=500_000, fd=True)
+    with pytest.raises(can.CanInitializationError):
+        can.Bus(interface="cantap", channel="virtual:load=0,serial=X", bitrate=3)
+    for wrong in (message(is_fd=True), message(is_error_frame=True), can.Message(arbitration_id=0x800, is_extended_id=False)):
+        with pytest.raises(can.CanOperationError):
+            first.send(wrong)
+
+
+def test_a_bus_that_is_shut_down_gives_nothing():
+    bus = can.Bus(interface="cantap", channel=QUIET, bitrate=500_000)
+    bus.shutdown()
+    with pytest.raises(can.CanOperationError):
+        bus.recv(0)
+    with pytest.raises(can.CanOperationError):
+        bus.send(message())

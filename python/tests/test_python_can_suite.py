@@ -1,0 +1,41 @@
+"""python-can's own tests, unchanged, on the analyser. They are fetched, not copied: `cargo xtask test --only python` does that."""
+
+import os
+import pathlib
+import re
+import subprocess
+import sys
+
+import pytest
+
+SOURCE = os.environ.get("CANTAP_PYTHON_CAN_SOURCE")
+
+# Each file, what of it is for any interface, and how many tests that are at least.
+TESTS = [
+    # `unique` opens a third bus, and there are two channels; the second object of a channel does not hear the first one's frames.
+    ("back2back_test.py", "Back2BackTestCase and not unique", 11),
+    # `restart` and `thread_based` are about the class of python-can's threads.
+    ("simplecyclic_test.py", "not restart and not thread_based", 5),
+    ("notifier_test.py", "", 5),
+    ("test_message_filtering.py", "", 3),
+    ("contextmanager_test.py", "", 2),
+]
+
+
+@pytest.mark.skipif(SOURCE is None, reason="CANTAP_PYTHON_CAN_SOURCE names no sources of python-can")
+@pytest.mark.parametrize(("file", "chosen", "least"), TESTS)
+def test_python_cans_own(file, chosen, least):
+    here = pathlib.Path(__file__).parent / "python_can"
+    path = os.pathsep.join([str(here), *filter(None, [os.environ.get("PYTHONPATH")])])
+    result = subprocess.run(
+        [sys.executable, "-P", "-m", "pytest", "-p", "cantap_harness", "-p", "no:cacheprovider", "-q",
+         "-c", os.devnull, "--rootdir", SOURCE, f"{SOURCE}/test/{file}", "-k", chosen],
+        capture_output=True,
+        text=True,
+        cwd=SOURCE,
+        env={**os.environ, "PYTHONPATH": path},
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    passed = re.search(r"(\d+) passed", result.stdout)
+    assert passed and int(passed[1]) >= least, result.stdout

@@ -1,0 +1,91 @@
+//! The package for Python: built as a wheel, installed into a fresh environment, checked and tested there.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::{Context, Result, ensure};
+use xshell::{Shell, cmd};
+
+use crate::outcome::Outcome;
+use crate::peers::{self, Peers};
+use crate::workspace;
+
+/// Where its crate is.
+const MANIFEST: &str = "python/Cargo.toml";
+
+/// Builds a wheel by a profile of the package's and returns its path.
+pub fn wheel(shell: &Shell, profile: &str, out: &Path) -> Result<PathBuf> {
+    let maturin = peers::venv(shell)?.join("bin/maturin");
+    shell.remove_path(out)?;
+    cmd!(shell, "{maturin} build --manifest-path {MANIFEST} --profile {profile} --out {out}")
+        .env("CARGO_TARGET_DIR", target())
+        .run()?;
+    only_file(out)
+}
+
+/// Packs the sources, with those of the crates that it is made of, and returns the archive's path.
+pub fn source_archive(shell: &Shell, out: &Path) -> Result<PathBuf> {
+    let maturin = peers::venv(shell)?.join("bin/maturin");
+    shell.remove_path(out)?;
+    cmd!(shell, "{maturin} sdist --manifest-path {MANIFEST} --out {out}").run()?;
+    only_file(out)
+}
+
+/// The whole step.
+pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
+    if peers.is_none() {
+        return Ok(Outcome::Skipped("its tests need the peers, which cannot be installed here".to_owned()));
+    }
+    // Lints first: they need no wheel.
+    cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
+    let wheel = wheel(shell, "ci", &target().join("wheels"))?;
+    let python = environment(shell, &wheel)?;
+    cmd!(shell, "{python} -m mypy --strict python/cantap").run()?;
+    cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
+    let suite = python_can(shell, &python)?;
+    let pytest = python.with_file_name("python");
+    // Not from `python/`, where `import cantap` would find the sources.
+    cmd!(shell, "{pytest} -m pytest --quiet python/tests").env("CANTAP_PYTHON_CAN_SOURCE", suite).run()?;
+    Ok(Outcome::Passed)
+}
+
+/// Where its crates are compiled: with features and profiles of their own.
+fn target() -> PathBuf {
+    workspace::target().join("python")
+}
+
+/// A fresh environment that has this wheel, and sees the peers' packages.
+fn environment(shell: &Shell, wheel: &Path) -> Result<PathBuf> {
+    let venv = target().join("venv");
+    cmd!(shell, "python3 -m venv --clear {venv}").run()?;
+    let python = venv.join("bin/python");
+    let where_packages_are = "import sysconfig; print(sysconfig.get_path('purelib'))";
+    let of_peers = peers::venv(shell)?.join("bin/python");
+    let theirs = cmd!(shell, "{of_peers} -c {where_packages_are}").read()?;
+    let ours = cmd!(shell, "{python} -c {where_packages_are}").read()?;
+    shell.write_file(Path::new(&ours).join("peers.pth"), theirs)?;
+    cmd!(shell, "{python} -m pip install --quiet --no-deps --no-index {wheel}").run()?;
+    Ok(python)
+}
+
+/// The sources of the python-can that the peers have, with its own tests.
+fn python_can(shell: &Shell, python: &Path) -> Result<PathBuf> {
+    let wanted = shell.read_file(peers::REQUIREMENTS)?;
+    let wanted =
+        wanted.lines().find(|line| line.starts_with("python-can==")).context("no python-can in the peers")?;
+    let version = wanted.trim_start_matches("python-can==");
+    let folder = target().join(format!("python_can-{version}"));
+    if !folder.join("test").exists() {
+        let out = target();
+        let pip = "--quiet --retries 10 --no-deps --no-binary python-can".split(' ');
+        cmd!(shell, "{python} -m pip download {pip...} --dest {out} {wanted}").run()?;
+        let archive = out.join(format!("python_can-{version}.tar.gz"));
+        cmd!(shell, "tar --extract --file {archive} --directory {out}").run()?;
+    }
+    Ok(folder)
+}
+
+fn only_file(folder: &Path) -> Result<PathBuf> {
+    let mut files = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
+    ensure!(files.len() == 1, "one file was to be made in {}, there are {}", folder.display(), files.len());
+    Ok(files.remove(0))
+}

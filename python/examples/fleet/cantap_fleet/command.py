@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import io
+import atexit
 import re
+import shutil
 import sys
 import tempfile
 import zipfile
@@ -73,16 +74,18 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def ship(spark: SparkSession) -> None:
-    """Sends this package to the workers, wherever it comes from."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
+    """Sends this package to the workers, wherever it comes from; a session that has it keeps it."""
+    name = f"{__package__}.zip"
+    if any(file.endswith(name) for file in spark.sparkContext.listFiles):
+        return
+    folder = tempfile.mkdtemp(prefix="cantap-fleet-")
+    # Spark serves the file from where it lies, as long as the driver runs.
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    with zipfile.ZipFile(Path(folder) / name, "w") as archive:
         for part in sorted(resources.files(__package__).iterdir(), key=lambda part: part.name):
             if part.name.endswith(".py"):
                 archive.writestr(f"{__package__}/{part.name}", part.read_bytes())
-    # Spark takes a file of the driver's machine, and serves it to the workers.
-    path = Path(tempfile.mkdtemp(prefix="cantap-fleet-")) / "cantap_fleet.zip"
-    path.write_bytes(packed.getvalue())
-    spark.sparkContext.addPyFile(str(path))
+    spark.sparkContext.addPyFile(str(Path(folder) / name))
 
 
 def _decode(spark: SparkSession, arguments: argparse.Namespace) -> int:

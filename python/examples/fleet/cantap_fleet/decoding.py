@@ -20,7 +20,7 @@ import cantap
 import pyarrow as pa
 
 from . import columns
-from .ledger import CUT, DAMAGED, FAILED, REFUSED, Entry
+from .ledger import CUT, DAMAGED, EMPTY, FAILED, READ, REFUSED, Entry
 
 
 class Request(TypedDict):
@@ -101,13 +101,20 @@ def decode(request: Request) -> Entry:
         entry.faults = [_without_folders(fault, request) for fault in report.faults]
         entry.left_out, entry.notes = report.left_out, report.notes
         entry.problem = entry.faults[0] if entry.faults else None
-        if report.is_cut and report.issues == 1:
-            entry.state = CUT
-        elif not report.is_whole:
-            entry.state = DAMAGED
+        entry.state = _state(report)
+        if entry.state == EMPTY:
+            entry.problem = "it has no record"
         return entry
     entry.signal_rows = entry.decoded = 0
     return entry
+
+
+def _state(report: cantap.Report) -> str:
+    if report.is_whole:
+        return READ if report.records_read or report.left_out else EMPTY
+    # Where compressed data ends too early, so does what is in them: two places, one cause.
+    causes = 2 if report.issues == 2 and "inside the compressed data" in report.faults[-1] else 1
+    return CUT if report.is_cut and report.issues == causes else DAMAGED
 
 
 def _in_words(error: Exception, request: Request) -> str:

@@ -11,6 +11,8 @@ READ = "read"
 CUT = "cut"
 #: Places in it could not be read; the rest is there.
 DAMAGED = "damaged"
+#: It was read to its end, and has nothing in it.
+EMPTY = "empty"
 #: It is no trace, or its vehicle's databases cannot be used. It has no rows.
 REFUSED = "refused"
 #: The system did not deliver it, reading it took too long, or the process that read it died, twice. It has no rows.

@@ -7,7 +7,7 @@ import os
 import shutil
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -88,11 +88,11 @@ class _Workplace:
         if row["content"] is None:
             raise Failed("Spark does not hand out files of 2 GiB or more, or whose names begin with _ or .")
         # Its own name: the suffix says the format.
-        path = self._folder / "trace" / PurePosixPath(row["trace"]).name
-        shutil.rmtree(path.parent, ignore_errors=True)
-        path.parent.mkdir()
-        path.write_bytes(row["content"])
-        return str(path)
+        fetched = self._folder / "trace" / PurePosixPath(row["trace"]).name
+        shutil.rmtree(fetched.parent, ignore_errors=True)
+        fetched.parent.mkdir()
+        fetched.write_bytes(row["content"])
+        return str(fetched)
 
     def _database(self, name: str) -> str:
         path = self._folder / "databases" / name
@@ -112,10 +112,10 @@ def local_path(url: str) -> str | None:
 
 def decoder(
     settings: Settings, databases: Broadcast[dict[str, bytes]]
-) -> Callable[[Iterator[pa.RecordBatch]], Iterator[pa.RecordBatch]]:
+) -> Callable[[Iterable[pa.RecordBatch]], Iterable[pa.RecordBatch]]:
     """The function for `mapInArrow`."""
 
-    def decode(batches: Iterator[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
+    def decode(batches: Iterable[pa.RecordBatch]) -> Iterator[pa.RecordBatch]:
         workplace = _Workplace(settings, databases.value)
         try:
             for batch in batches:

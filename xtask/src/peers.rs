@@ -47,11 +47,16 @@ impl Peers {
     }
 }
 
-/// A Python environment with the packages of `peers.txt`, made anew where that file has changed.
+/// A Python environment with the packages of `peers.txt`.
 pub fn venv(shell: &Shell) -> Result<PathBuf> {
-    let venv = workspace::target().join("peers");
+    environment(shell, "peers", REQUIREMENTS)
+}
+
+/// A Python environment under this name in `target/`, with the packages that a file names, made anew where that has changed.
+pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<PathBuf> {
+    let venv = workspace::target().join(name);
     let installed = venv.join("installed.txt");
-    let wanted = shell.read_file(REQUIREMENTS)?;
+    let wanted = shell.read_file(requirements)?;
     if shell.read_file(&installed).is_ok_and(|text| text == wanted) {
         return Ok(venv);
     }
@@ -63,7 +68,7 @@ pub fn venv(shell: &Shell) -> Result<PathBuf> {
     }
     cmd!(shell, "python3 -m venv --clear {venv}").run()?;
     let python = venv.join("bin/python");
-    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {REQUIREMENTS}").run()?;
+    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {requirements}").run()?;
     shell.write_file(installed, wanted)?;
     Ok(venv)
 }

@@ -10,6 +10,8 @@ mod bus;
 #[cfg(feature = "bench")]
 mod clock;
 #[cfg(feature = "bench")]
+mod columns;
+#[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
 mod extent;
@@ -45,6 +47,8 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
+    /// Sizes and times of Parquet, beside trace formats.
+    Columns,
     /// What the command occupies with long traces, in every format.
     Memory,
     /// Decoding signals, against cantools.
@@ -118,6 +122,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
+            Subject::Columns => columns::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run(&extent)?,

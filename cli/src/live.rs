@@ -300,7 +300,7 @@ pub fn unasked(error: anyhow::Error, given: &[Address], without: &str) -> anyhow
 }
 
 /// What there is to say of a device that is there again, with its name if there are several.
-fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
+pub fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
     let after = back.after.unwrap_or_default().as_secs_f64();
     let at = name.map_or_else(String::new, |name| format!(" at '{name}'"));
     let mut said = match &back.other_board {

@@ -90,3 +90,24 @@ pub(crate) trait Encode: Send {
         memchr::memrchr(b'\n', bytes).map_or(0, |end| end + 1)
     }
 }
+
+/// The line in front of the first row of a table.
+pub(crate) struct HeadLine {
+    text: &'static str,
+    is_written: bool,
+}
+
+impl HeadLine {
+    /// Not written yet; `text` is without its line end.
+    pub(crate) const fn of(text: &'static str) -> Self {
+        Self { text, is_written: false }
+    }
+
+    /// Writes it, the first time.
+    pub(crate) fn write(&mut self, out: &mut Vec<u8>) {
+        if !std::mem::replace(&mut self.is_written, true) {
+            out.extend_from_slice(self.text.as_bytes());
+            out.push(b'\n');
+        }
+    }
+}

@@ -20,6 +20,7 @@ macro_rules! eprint {
     }};
 }
 
+mod address;
 mod advice;
 mod args;
 mod beside;
@@ -44,6 +45,7 @@ mod monitor;
 mod progress;
 mod rescue;
 mod sending;
+mod server;
 mod shells;
 mod stderr;
 mod timing_args;
@@ -57,8 +59,6 @@ mod wrong;
 use std::error::Error;
 use std::process::ExitCode;
 
-use cantap_address as address;
-use cantap_address::server;
 use clap::{CommandFactory, Parser};
 use clap_complete::CompleteEnv;
 

@@ -69,8 +69,9 @@ pub fn channel(number: u8) -> Result<Channel, Error> {
 }
 
 /// Lets Python's signals through.
+#[expect(clippy::redundant_closure_for_method_calls, reason = "the method is for one lifetime")]
 pub fn signals() -> Result<(), Error> {
-    Python::attach(Python::check_signals).map_err(Error::Python)
+    Python::attach(|py| py.check_signals()).map_err(Error::Python)
 }
 
 /// A frame that was not sent.

@@ -8,7 +8,7 @@ use std::process::Command;
 
 use cantap_protocols::iso_tp::{FlowStatus, Pci, parse};
 use cantap_protocols::j1939::Header;
-use cantap_protocols::{Conversations, Event, Options, Protocol, Value};
+use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
@@ -45,8 +45,8 @@ fn tshark(test: &str, frames: &[TraceFrame], decode_as: &[&str], fields: &[&str]
     std::fs::write(&path, pcap).unwrap();
     let mut command = Command::new("tshark");
     command.arg("-r").arg(&path).args(["-T", "fields", "-E", "separator=|", "-E", "occurrence=l"]);
-    decode_as.iter().for_each(|rule| drop(command.args(["-d", rule])));
-    fields.iter().for_each(|field| drop(command.args(["-e", field])));
+    command.args(decode_as.iter().flat_map(|rule| ["-d", rule]));
+    command.args(fields.iter().flat_map(|field| ["-e", field]));
     let output = command.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let rows: Vec<Row> = String::from_utf8(output.stdout)

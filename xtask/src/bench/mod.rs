@@ -22,6 +22,8 @@ mod memory;
 #[cfg(feature = "bench")]
 mod monitor;
 #[cfg(feature = "bench")]
+mod protocols;
+#[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
 mod stats;
@@ -57,6 +59,8 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// Frames per second that all protocols read together.
+    Protocols,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
 }
@@ -116,6 +120,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Protocols => protocols::run()?,
             Subject::Monitor => monitor::run(args.seconds)?,
         }
     }

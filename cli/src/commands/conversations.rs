@@ -97,7 +97,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
+/// Writes an event as a line.
+pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
     if json {
         return json::write(out, event);
     }

@@ -5,6 +5,7 @@
 
 #![forbid(unsafe_code)]
 
+pub mod active;
 mod assembler;
 pub mod canopen;
 mod condition;

@@ -149,7 +149,8 @@ fn boat() -> Bus {
         bus.wait_ms(100);
     }
     let mut engine = [0xFF; 26];
-    engine[..13].copy_from_slice(&[0, 0xA0, 0x0F, 0xFF, 0xFF, 0x8D, 0x7E, 0xC8, 0x05, 0xFF, 0xFF, 0x10, 0x0E]);
+    engine[..13]
+        .copy_from_slice(&[0, 0xA0, 0x0F, 0xFF, 0xFF, 0x8D, 0x7E, 0xC8, 0x05, 0xFF, 0xFF, 0x10, 0x0E]);
     bus.fast("09F20101", 2, &engine);
     // One that misses its second frame.
     let whole = bus.frames.len();
@@ -170,7 +171,8 @@ fn check(name: &str, bus: &Bus) {
         .frames
         .iter()
         .map(|(us, frame)| {
-            let event = TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
+            let event =
+                TraceEvent::Frame { frame: frame.parse().unwrap(), direction: Direction::Rx, late: false };
             TraceRecord { time_ns: *us as i64 * 1000, channel: 1, event }
         })
         .collect();
@@ -191,7 +193,8 @@ fn check(name: &str, bus: &Bus) {
     }
     for ((_, protocol, node), known) in overview.nodes() {
         let state = known.state.as_deref().map_or(String::new(), |state| format!(", {state}"));
-        writeln!(text, "# {protocol} {node}: {} events, {} faults{state}", known.events, known.faults).unwrap();
+        writeln!(text, "# {protocol} {node}: {} events, {} faults{state}", known.events, known.faults)
+            .unwrap();
     }
     for (suffix, is) in [("log", &log), ("txt", &text)] {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join(format!("tests/buses/{name}.{suffix}"));

@@ -10,11 +10,15 @@ mod bus;
 #[cfg(feature = "bench")]
 mod clock;
 #[cfg(feature = "bench")]
+mod columns;
+#[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
 mod extent;
 #[cfg(feature = "bench")]
 mod formats;
+#[cfg(feature = "bench")]
+mod graph;
 #[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
@@ -23,6 +27,8 @@ mod memory;
 mod monitor;
 #[cfg(feature = "bench")]
 mod protocols;
+#[cfg(all(feature = "bench", unix))]
+mod serve;
 #[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
@@ -43,6 +49,8 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
+    /// Sizes and times of Parquet, beside trace formats.
+    Columns,
     /// What the command occupies with long traces, in every format.
     Memory,
     /// Decoding signals, against cantools.
@@ -61,8 +69,14 @@ enum Subject {
     Stats,
     /// Frames per second that all protocols read together.
     Protocols,
+    /// Redraws of the live view's graph with five million values in the window.
+    Graph,
+    /// The package for Python, beside python-can, cantools and asammdf.
+    Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
+    /// A shared board: eight clients on two saturated channels, two of them slow.
+    Serve,
 }
 
 /// What `cargo xtask bench` takes.
@@ -70,7 +84,7 @@ enum Subject {
 pub struct Args {
     /// What to measure; everything if not given.
     subject: Vec<Subject>,
-    /// How long the live view is watched.
+    /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
     /// Of what is measured on the emulated board, only the rows whose names contain this.
@@ -112,6 +126,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
+            Subject::Columns => columns::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run(&extent)?,
@@ -121,7 +136,15 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
             Subject::Protocols => protocols::run()?,
+            Subject::Graph => graph::run()?,
+            Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,
+            #[cfg(unix)]
+            Subject::Serve => serve::run(args.seconds)?,
+            #[cfg(not(unix))]
+            Subject::Serve => {
+                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+            }
         }
     }
     Ok(())

@@ -135,8 +135,8 @@ impl App {
             (View::Signals, KeyCode::Char('s')) => self.signals.sort = self.signals.sort.next(),
             (View::Signals, KeyCode::Char('S')) => self.signals.reverse = !self.signals.reverse,
             (View::Signals, KeyCode::Char('g')) => self.signals.grouped = !self.signals.grouped,
-            (View::Signals, KeyCode::Char('F')) => {
-                let text = self.signals.filter.text().to_owned();
+            (View::Signals | View::Fixed, KeyCode::Char('F')) => {
+                let text = self.signal_filter().text().to_owned();
                 self.ask(PromptKind::Signals, &text);
             }
             (View::Graph, code) => self.graph.key(code),

@@ -36,6 +36,34 @@ use crate::address::Address;
 /// A small screen and a wide one.
 const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];
 
+/// An engine whose frames may leave out the brake, and a door.
+const SIGNALS: &str = r#"
+    version = 1
+    [[message]]
+    name = "Engine"
+    id = 0x100
+    length = 3
+    [[message.signal]]
+    name = "Speed"
+    at = "D1"
+    unit = "rpm"
+    [[message.signal]]
+    name = "OilTemp"
+    at = "D2"
+    alarm = { max = 120 }
+    [[message.signal]]
+    name = "Brake"
+    at = "D3"
+    digital = { low = 0, high = 1 }
+    [[message]]
+    name = "Body"
+    id = 0x200
+    length = 1
+    [[message.signal]]
+    name = "Door"
+    at = "D1"
+"#;
+
 fn here() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/monitor/snapshots")
 }

@@ -6,6 +6,7 @@
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
 
 pub mod eds;
+mod encode;
 mod lss;
 mod names;
 mod pdo;
@@ -14,6 +15,11 @@ mod signs;
 #[cfg(test)]
 mod tests;
 mod types;
+
+pub use encode::{BadValue, encode, type_named};
+pub use names::{abort as abort_text, state as state_name};
+pub(crate) use sdo::crc_of;
+pub use types::known as known_type;
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -261,7 +267,8 @@ impl CanOpen {
                 {
                     node.guarded_ns = None;
                     let title = "guarding has stopped for longer than the life time";
-                    let mut event = event(guarded_ns + life_ns, guarded_ns, number, "guarding_stopped", title);
+                    let mut event =
+                        event(guarded_ns + life_ns, guarded_ns, number, "guarding_stopped", title);
                     event.trouble = Some(Trouble::Timeout { after_ms: (life_ns / 1_000_000) as u32 });
                     event.frames = 0;
                     events.push(event);

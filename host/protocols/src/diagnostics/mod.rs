@@ -13,7 +13,10 @@ mod tests;
 mod uds;
 
 pub use dtc::Dtc;
+pub(crate) use names::has_sub_function;
 pub use names::{data_identifier, reason, uds_service};
+pub use obd::name as parameter_name;
+pub(crate) use uds::is_response_suppressed;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;

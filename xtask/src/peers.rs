@@ -10,6 +10,9 @@ use crate::workspace;
 
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
+/// Also where no peer may be skipped: its package starts a server that other computers reach, which is nobody's wish but a test
+/// machine's.
+const SSH_SERVER: (&str, &str) = ("/usr/sbin/sshd", "openssh-server");
 /// Python packages, with their versions.
 pub const REQUIREMENTS: &str = "xtask/peers.txt";
 
@@ -23,8 +26,10 @@ impl Peers {
     /// Finds the peers, and installs what is missing where that is possible. `None`, with a word on
     /// what to run, where it is not: the tests that need them then say that they were skipped.
     pub fn find_or_install(shell: &Shell) -> Result<Option<Self>> {
+        let must_not_skip = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
         let missing: Vec<&str> = PROGRAMS
             .iter()
+            .chain(must_not_skip.then_some(&SSH_SERVER))
             .filter(|(program, _)| !is_installed(program))
             .map(|(_, package)| *package)
             .collect();

@@ -18,11 +18,15 @@ mod extent;
 #[cfg(feature = "bench")]
 mod formats;
 #[cfg(feature = "bench")]
+mod graph;
+#[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
 mod memory;
 #[cfg(feature = "bench")]
 mod monitor;
+#[cfg(all(feature = "bench", unix))]
+mod serve;
 #[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
@@ -61,8 +65,14 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// Redraws of the live view's graph with five million values in the window.
+    Graph,
+    /// The package for Python, beside python-can, cantools and asammdf.
+    Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
+    /// A shared board: eight clients on two saturated channels, two of them slow.
+    Serve,
 }
 
 /// What `cargo xtask bench` takes.
@@ -70,7 +80,7 @@ enum Subject {
 pub struct Args {
     /// What to measure; everything if not given.
     subject: Vec<Subject>,
-    /// How long the live view is watched.
+    /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
     /// Of what is measured on the emulated board, only the rows whose names contain this.
@@ -121,7 +131,15 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Graph => graph::run()?,
+            Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,
+            #[cfg(unix)]
+            Subject::Serve => serve::run(args.seconds)?,
+            #[cfg(not(unix))]
+            Subject::Serve => {
+                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+            }
         }
     }
     Ok(())

@@ -13,8 +13,8 @@ use cantap_protocols::Event;
 use cantap_protocols::active::Announcement;
 use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
 
-use super::conversations::SheetPath;
 use crate::args;
+use crate::protocols::SheetPath;
 use crate::speaking::SpeakArgs;
 use crate::wrong::wrong;
 

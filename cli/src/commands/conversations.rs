@@ -11,7 +11,6 @@ use std::sync::Arc;
 use cantap_protocols::{Event, Options, Protocol};
 use cantap_trace::Interface;
 
-pub use self::sheet::SheetPath;
 use self::summary::Summary;
 use super::decode::Seconds;
 use crate::databases::DatabaseArgs;

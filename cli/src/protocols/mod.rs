@@ -12,7 +12,7 @@ use cantap_protocols::{Conversations, Event, Options, UnderWay};
 use cantap_signals::Decoder;
 use cantap_signals::condition::{Condition, ConditionError};
 
-use self::sheet::SheetPath;
+pub use self::sheet::SheetPath;
 use self::surveyed::Surveyed;
 
 pub use known::{Known, about, named};

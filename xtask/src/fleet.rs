@@ -30,7 +30,7 @@ pub fn check(shell: &Shell, wheel: &Path) -> Result<()> {
         .run()?;
     // As the tests' step leaves it; without it one test says that it was skipped.
     let command = workspace::target().join("debug/cantap");
-    let named = command.exists().then(|| ("CANTAP_COMMAND", command));
+    let named = command.exists().then_some(("CANTAP_COMMAND", command));
     cmd!(shell, "{python} -m pytest --quiet python/tests/test_fleet.py").envs(named).run()?;
     Ok(())
 }

@@ -20,7 +20,7 @@ from ._native import (
     __version__,
 )
 from .device import Checksum, Counter, Device, RandomByte, boards, open
-from .traces import Database, load_database, read, scan
+from .traces import Database, Messages, decode, load_database, read, scan, search, stats, write
 
 __all__ = [
     "CantapError",
@@ -33,6 +33,7 @@ __all__ = [
     "DeviceError",
     "FormatError",
     "Frame",
+    "Messages",
     "PeriodicFrame",
     "RandomByte",
     "Record",
@@ -43,8 +44,12 @@ __all__ = [
     "Table",
     "__version__",
     "boards",
+    "decode",
     "load_database",
     "open",
     "read",
     "scan",
+    "search",
+    "stats",
+    "write",
 ]

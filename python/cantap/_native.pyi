@@ -3,7 +3,33 @@
 import os
 from collections.abc import Iterator
 from types import TracebackType
-from typing import Any, TypedDict, final
+from typing import Any, TypedDict, final, type_check_only
+
+__all__ = [
+    "CantapError",
+    "CantapWarning",
+    "Database",
+    "DatabaseError",
+    "Device",
+    "DeviceError",
+    "FormatError",
+    "Frame",
+    "PeriodicFrame",
+    "Record",
+    "Records",
+    "Reply",
+    "Report",
+    "Scan",
+    "Table",
+    "__version__",
+    "decode",
+    "decode_table",
+    "list_boards",
+    "no_records",
+    "search",
+    "stats",
+    "write",
+]
 
 __version__: str
 
@@ -22,6 +48,7 @@ class DatabaseError(CantapError):
 class CantapWarning(UserWarning):
     """Something was left out, and the rest can be used."""
 
+@type_check_only
 class Options(TypedDict):
     path: str | os.PathLike[str]
     db: Database | None
@@ -129,6 +156,18 @@ class Table:
         """What is known about a column beside its values: its unit, its description."""
     def batches(self) -> list[Table]:
         """The table in the pieces that it has in memory."""
+    def to_numpy(self) -> dict[str, Any]:
+        """The columns as NumPy arrays: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
+
+        What has no value is masked.
+        """
+    def to_pyarrow(self) -> Any:
+        """The same table as pyarrow's."""
+    def to_pandas(self) -> Any:
+        """The same table as pandas'."""
+    def to_polars(self) -> Any:
+        """The same table as Polars'."""
+    def _parts(self, name: str) -> tuple[str, bytes, bytes | None, list[str] | None, int]: ...
     def __len__(self) -> int: ...
     def __arrow_c_schema__(self) -> object: ...
     def __arrow_c_stream__(self, requested_schema: object | None = None) -> object: ...
@@ -190,7 +229,7 @@ class Frame:
     def data(self) -> bytes:
         """The data bytes."""
     def __hash__(self) -> int: ...
-    def __eq__(self, other: object) -> bool: ...
+    def __eq__(self, other: object, /) -> bool: ...
 
 @final
 class Record:
@@ -239,7 +278,7 @@ class Record:
     def late(self) -> bool:
         """Whether the frame ended then or earlier."""
     def __hash__(self) -> int: ...
-    def __eq__(self, other: object) -> bool: ...
+    def __eq__(self, other: object, /) -> bool: ...
 
 @final
 class Records(Iterator[Record]):
@@ -338,3 +377,21 @@ class Device:
     def close(self) -> None: ...
 
 def list_boards() -> list[tuple[str, str | None, str | None]]: ...
+
+def stats(
+    options: Options,
+    bitrates: list[tuple[int | None, int]],
+    data_bitrates: list[tuple[int | None, int]],
+    window_s: float,
+) -> dict[str, Any]: ...
+def decode(options: Options) -> tuple[tuple[list[tuple[str, Table]], Table], Report]: ...
+def decode_table(
+    table: Any, db: Database, signals: list[str]
+) -> tuple[list[tuple[str, Table]], Table]: ...
+def search(
+    options: Options, condition: str | None, ids: list[str], data: list[str], max_count: int | None
+) -> Table: ...
+def no_records() -> Table: ...
+def write(
+    table: Any, path: str | os.PathLike[str], format: str | None, zone: str | None
+) -> dict[str, int]: ...

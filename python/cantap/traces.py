@@ -5,7 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from . import _native
@@ -97,6 +97,161 @@ def read(
     return Scan(options, BATCH_ROWS).read_all()
 
 
+class Messages(Mapping[str, Table]):
+    """A decoded trace: by message's name a table with the columns `time`, `channel`, `id` and one for each signal.
+
+    A signal with texts has two: `Gear` and `Gear.text`. Where a frame does not have a signal, there is no value.
+    """
+
+    def __init__(self, tables: dict[str, Table], events: Table, report: Report | None) -> None:
+        self._tables = tables
+        self.events = events
+        """What happened beside frames: losses, bus errors, states. A series with a hole is explained here."""
+        self.report = report
+        """What was read, and what could not be; `None` if no file was."""
+
+    def __getitem__(self, message: str) -> Table:
+        return self._tables[message]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._tables)
+
+    def __len__(self) -> int:
+        return len(self._tables)
+
+    def __repr__(self) -> str:
+        return f"<cantap.Messages: {', '.join(self._tables)}>"
+
+
+def decode(
+    source: Any,
+    db: Databases,
+    *,
+    signals: Words = (),
+    filter: Words = (),
+    channel: int | Iterable[int] = (),
+    start: Time | None = None,
+    end: Time | None = None,
+    format: str | None = None,
+    zone: str | None = None,
+    strict: bool = False,
+) -> Messages:
+    """Decodes a trace into a table for each message, with a column for each signal.
+
+    `source` is a file, or a table of records, such as a device's batches: of this package, or of anything else that exports Arrow.
+    What of a file is asked for is as with `scan`; of a table it is `signals` alone.
+    """
+    if isinstance(source, (str, os.PathLike)):
+        options = _options(source, db, signals, filter, channel, start, end, format, zone, strict)
+        (tables, events), report = _native.decode(options)
+        return Messages(dict(tables), events, report)
+    if filter or channel != () or (start, end, format, zone) != (None,) * 4 or strict:
+        raise ValueError("of a table only signals can be chosen; choose its rows before")
+    tables, events = _native.decode_table(_with_our_types(source), _database(db), _words(signals))
+    return Messages(dict(tables), events, None)
+
+
+def search(
+    path: Path,
+    condition: str | None = None,
+    *,
+    id: Words = (),
+    data: Words = (),
+    max_count: int | None = None,
+    db: Databases | None = None,
+    filter: Words = (),
+    channel: int | Iterable[int] = (),
+    start: Time | None = None,
+    end: Time | None = None,
+    format: str | None = None,
+    zone: str | None = None,
+    strict: bool = False,
+) -> Table:
+    """The records for which everything that is given holds, with `place`, their number among those that were read, from 0.
+
+    `condition`: as `cantap search` takes it, such as `"Speed > 80 and Gear == Drive"`. `id`: `123`, `18FEF1??`, `100-1FF`; any of
+    several. `data`: bytes from the first on, `"11 ?? 3?"`, with `*` for any number; any of several.
+    """
+    options = _options(path, db, (), filter, channel, start, end, format, zone, strict)
+    return _native.search(options, condition, _words(id), _words(data), max_count)
+
+
+def stats(
+    path: Path,
+    bitrate: int | Mapping[int, int] | None = None,
+    *,
+    data_bitrate: int | Mapping[int, int] | None = None,
+    window: float = 1.0,
+    filter: Words = (),
+    channel: int | Iterable[int] = (),
+    start: Time | None = None,
+    end: Time | None = None,
+    format: str | None = None,
+    zone: str | None = None,
+    strict: bool = False,
+) -> dict[str, Any]:
+    """Statistics of a trace, as `cantap stats --json` has them: load, rates, periods and jitter by identifier, losses, errors.
+
+    `bitrate` in bit/s, of all channels or by channel; without it there is no load. `data_bitrate`: of CAN FD's data phases.
+    `window`: seconds in which peaks are looked for.
+    """
+    options = _options(path, None, (), filter, channel, start, end, format, zone, strict)
+    return _native.stats(options, _rates(bitrate), _rates(data_bitrate), window)
+
+
+def _rates(rates: int | Mapping[int, int] | None) -> list[tuple[int | None, int]]:
+    if rates is None:
+        return []
+    return [(None, rates)] if isinstance(rates, int) else list(rates.items())
+
+
+def write(
+    table: Any, path: Path, *, format: str | None = None, zone: str | None = None
+) -> dict[str, int]:
+    """Writes a table of records as a trace, in the format that the name says or `format`; `.parquet` as well.
+
+    `table` is of this package, or of anything else that exports Arrow, with the columns of `read`. An older file of that name
+    stays as it is until the new one is whole. Returns what the format could not carry, by kind; if it is anything, it is a
+    `CantapWarning` too.
+    """
+    left_out = _native.write(_with_our_types(table), path, format, zone)
+    for what, count in left_out.items():
+        warnings.warn(f"{path} does not carry {what} ({count})", CantapWarning, stacklevel=2)
+    return left_out
+
+
+def _with_our_types(table: Any) -> Any:
+    """Other programs have types of their own for texts and bytes; pyarrow, where it is installed, casts them."""
+    if isinstance(table, (Table, Scan)) or not hasattr(table, "__arrow_c_stream__"):
+        return table
+    try:
+        import pyarrow as pa
+    except ImportError:
+        return table
+    theirs = pa.table(table)
+    columns = {}
+    try:
+        for field in pa.schema(_native.no_records()):
+            if field.name in theirs.column_names:
+                column = theirs[field.name]
+                if pa.types.is_dictionary(column.type):
+                    column = pa.chunked_array([_plain(chunk) for chunk in column.chunks], pa.string())
+                # Texts may stay as they are.
+                to = pa.string() if pa.types.is_dictionary(field.type) else field.type
+                columns[field.name] = column.cast(to)
+    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
+        raise _native.FormatError(f"the table is no trace: {error}") from error
+    return pa.table(columns)
+
+
+def _plain(chunk: Any) -> Any:
+    """The texts of a dictionary. Its own may be of a type that pyarrow does not take texts out of."""
+    import pyarrow as pa
+
+    texts = chunk.dictionary.cast(pa.string())
+    return texts.take(chunk.indices)
+
+
 def _options(
     path: Path,
     db: Databases | None,
@@ -111,7 +266,7 @@ def _options(
 ) -> Options:
     return {
         "path": path,
-        "db": db if db is None or isinstance(db, Database) else load_database(db),
+        "db": None if db is None else _database(db),
         "signals": _words(signals),
         "filters": _words(filter),
         "channels": _channels(channel),
@@ -121,6 +276,10 @@ def _options(
         "zone": zone,
         "strict": strict,
     }
+
+
+def _database(db: Databases) -> Database:
+    return db if isinstance(db, Database) else load_database(db)
 
 
 def _channels(channel: int | Iterable[int]) -> list[int]:
@@ -155,4 +314,17 @@ def _time(time: Time | None) -> str | None:
     raise TypeError(f"a time is a number, a text, a timedelta or a datetime, not {type(time).__name__}")
 
 
-__all__ = ["Database", "Report", "Scan", "Table", "load_database", "read", "scan"]
+__all__ = [
+    "Database",
+    "Messages",
+    "Report",
+    "Scan",
+    "Table",
+    "decode",
+    "load_database",
+    "read",
+    "scan",
+    "search",
+    "stats",
+    "write",
+]

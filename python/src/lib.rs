@@ -6,10 +6,12 @@ mod database;
 mod device;
 mod error;
 mod frame;
+mod numpy;
 mod report;
 mod scan;
 mod source;
 mod table;
+mod traces;
 
 use pyo3::prelude::*;
 
@@ -22,6 +24,7 @@ fn _native(module: &Bound<'_, PyModule>) -> PyResult<()> {
     module.add_class::<frame::Record>()?;
     module.add_class::<report::Report>()?;
     device::register(module)?;
+    traces::register(module)?;
     module.add_class::<scan::Scan>()?;
     module.add_class::<table::Table>()?;
     module.add("__version__", env!("CARGO_PKG_VERSION"))

@@ -145,7 +145,7 @@ enum State {
 }
 
 /// Says what could not be read, as a Python warning.
-fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
+pub fn warn(py: Python<'_>, report: &Report) -> PyResult<()> {
     let Some(text) = report.now().warning() else { return Ok(()) };
     let text = std::ffi::CString::new(text.replace('\0', " "))?;
     PyErr::warn(py, &py.get_type::<CantapWarning>(), &text, 2)

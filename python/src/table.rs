@@ -16,6 +16,7 @@ use pyo3::prelude::*;
 use pyo3::types::{PyBytes, PyCapsule, PyDict, PyTuple};
 
 use crate::error::FormatError;
+use crate::numpy::{self, Parts};
 use crate::report::Report;
 
 const STREAM: &CStr = c"arrow_array_stream";
@@ -93,6 +94,34 @@ impl Table {
     /// The batches, each a table.
     fn batches(&self) -> Vec<Self> {
         self.batches.iter().cloned().map(Self::of_batch).collect()
+    }
+
+    /// A column as NumPy takes it, for Python's half.
+    fn _parts<'py>(&self, py: Python<'py>, name: &str) -> PyResult<Parts<'py>> {
+        let batch = self.one_batch()?;
+        let column = batch.column_by_name(name).ok_or_else(|| self.no_column(name))?;
+        Ok(numpy::parts(py, column.as_ref())?)
+    }
+
+    /// The columns as NumPy arrays, by name: times as datetime64, texts as objects, data bytes as a row of numbers for each frame.
+    /// What has no value is masked.
+    fn to_numpy<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        slf.py().import("cantap._arrays")?.call_method1("to_numpy", (slf,))
+    }
+
+    /// The same table as pyarrow's.
+    fn to_pyarrow<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        slf.py().import("pyarrow")?.call_method1("table", (slf,))
+    }
+
+    /// The same table as pandas'.
+    fn to_pandas<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        Self::to_pyarrow(slf)?.call_method0("to_pandas")
+    }
+
+    /// The same table as Polars'.
+    fn to_polars<'py>(slf: &Bound<'py, Self>) -> PyResult<Bound<'py, PyAny>> {
+        slf.py().import("polars")?.call_method1("DataFrame", (slf,))
     }
 
     fn __len__(&self) -> usize {

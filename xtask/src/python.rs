@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use anyhow::{Context, Result, ensure};
 use xshell::{Shell, cmd};
 
+use crate::fleet;
 use crate::outcome::Outcome;
 use crate::peers::{self, Peers};
 use crate::workspace;
@@ -12,21 +13,29 @@ use crate::workspace;
 /// Where its crate is.
 const MANIFEST: &str = "python/Cargo.toml";
 
-/// Builds a wheel by a profile of the package's and returns its path.
-pub fn wheel(shell: &Shell, profile: &str, out: &Path) -> Result<PathBuf> {
+/// Packs the sources, with those of the crates that it is made of, and builds a wheel from them alone. Returns both.
+pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
-    shell.remove_path(out)?;
-    cmd!(shell, "{maturin} build --manifest-path {MANIFEST} --profile {profile} --out {out}")
-        .env("CARGO_TARGET_DIR", target())
-        .run()?;
-    only_file(out)
+    let packed = target().join("sources");
+    shell.remove_path(&packed)?;
+    cmd!(shell, "{maturin} sdist --manifest-path {MANIFEST} --out {packed}").run()?;
+    let archive = only_file(&packed)?;
+    let unpacked = target().join("unpacked");
+    shell.remove_path(&unpacked)?;
+    shell.create_dir(&unpacked)?;
+    cmd!(shell, "tar --extract --file {archive} --directory {unpacked}").run()?;
+    let sources = only_file(&unpacked)?;
+    Ok([wheel(shell, &sources, "release", &target().join("dist"))?, archive])
 }
 
-/// Packs the sources, with those of the crates that it is made of, and returns the archive's path.
-pub fn source_archive(shell: &Shell, out: &Path) -> Result<PathBuf> {
+/// Builds a wheel of the sources in a folder by a profile of the package's and returns its path.
+fn wheel(shell: &Shell, sources: &Path, profile: &str, out: &Path) -> Result<PathBuf> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
+    let manifest = sources.join(MANIFEST);
     shell.remove_path(out)?;
-    cmd!(shell, "{maturin} sdist --manifest-path {MANIFEST} --out {out}").run()?;
+    cmd!(shell, "{maturin} build --manifest-path {manifest} --profile {profile} --out {out}")
+        .env("CARGO_TARGET_DIR", target())
+        .run()?;
     only_file(out)
 }
 
@@ -37,15 +46,27 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     }
     // Lints first: they need no wheel.
     cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
-    let wheel = wheel(shell, "ci", &target().join("wheels"))?;
+    let wheel = wheel(shell, &workspace::root(), "ci", &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
-    cmd!(shell, "{python} -m mypy --strict python/cantap").run()?;
+    cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap").run()?;
     cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
     let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");
     // Not from `python/`, where `import cantap` would find the sources.
-    cmd!(shell, "{pytest} -m pytest --quiet python/tests").env("CANTAP_PYTHON_CAN_SOURCE", suite).run()?;
+    cmd!(shell, "{pytest} -m pytest --quiet python/tests --ignore python/tests/test_fleet.py")
+        .env("CANTAP_PYTHON_CAN_SOURCE", suite)
+        .run()?;
+    fleet::check(shell, &wheel)?;
     Ok(Outcome::Passed)
+}
+
+/// Times it beside other people's packages.
+#[cfg(feature = "bench")]
+pub fn measure() -> Result<()> {
+    let shell = workspace::shell()?;
+    let wheel = wheel(&shell, &workspace::root(), "release", &target().join("dist"))?;
+    let python = environment(&shell, &wheel)?;
+    Ok(cmd!(shell, "{python} python/bench/side_by_side.py").run()?)
 }
 
 /// Where its crates are compiled: with features and profiles of their own.

@@ -43,9 +43,9 @@ pub fn run(args: &Args) -> Result<()> {
             What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is no Linux"),
             What::Deb => deb::pack(&shell, &dist)?,
             What::Python => {
-                let made = workspace::target().join("python/dist");
-                shell.copy_file(python::wheel(&shell, "release", &made.join("wheel"))?, &dist)?;
-                shell.copy_file(python::source_archive(&shell, &made.join("sources"))?, &dist)?;
+                for file in python::dist(&shell)? {
+                    shell.copy_file(file, &dist)?;
+                }
             }
             What::Firmware => firmware::pack(&shell, &dist)?,
         }

@@ -1,0 +1,160 @@
+"""Times this package beside python-can, cantools and asammdf, in one run: `cargo xtask bench python`.
+
+Prints a table for docs/benchmarks.md. Each figure is the best of a few runs, after one that nobody counts.
+"""
+
+import argparse
+import pathlib
+import random
+import tempfile
+import time
+
+import can
+import cantools
+from asammdf import MDF
+
+import cantap
+
+CAR = pathlib.Path(__file__).parents[2] / "host/virtual/src/car/car.dbc"
+
+
+def best(work, runs):
+    """The shortest time in seconds, and what came of it."""
+    times, result = [], None
+    for _ in range(runs + 1):
+        result = None
+        begin = time.perf_counter()
+        result = work()
+        times.append(time.perf_counter() - begin)
+    return min(times[1:]), result
+
+
+def make(folder, frames):
+    """A log of the car's messages with random data, as BLF and as MF4."""
+    random.seed(1)
+    messages = cantools.database.load_file(CAR).messages
+    text = folder / "drive.log"
+    with text.open("w") as out:
+        for at in range(frames):
+            message = messages[at % len(messages)]
+            identifier = f"{message.frame_id:08X}" if message.is_extended_frame else f"{message.frame_id:03X}"
+            data = random.randbytes(message.length).hex().upper()
+            out.write(f"({1.7e9 + at * 1e-4:.6f}) can0 {identifier}#{data}\n")
+    table = cantap.read(text)
+    cantap.write(table, folder / "drive.blf")
+    cantap.write(table, folder / "drive.mf4")
+
+
+def read_with_python_can(path):
+    with can.BLFReader(path) as reader:
+        return sum(1 for _ in reader)
+
+
+def decode_with_cantools(path):
+    database = cantools.database.load_file(CAR)
+    columns = {}
+    with can.BLFReader(path) as reader:
+        for message in reader:
+            try:
+                decoded = database.decode_message(message.arbitration_id, message.data, decode_choices=False)
+            except (KeyError, cantools.database.DecodeError):
+                continue
+            for name, value in decoded.items():
+                columns.setdefault((message.arbitration_id, name), []).append((message.timestamp, value))
+    return sum(map(len, columns.values()))
+
+
+def decode_with_asammdf(path):
+    with MDF(path) as file, file.extract_bus_logging({"CAN": [(str(CAR), 0)]}) as extracted:
+        return sum(len(group.channels) for group in extracted.groups)
+
+
+def recv_loop(messages):
+    """Messages per second of `can.Bus.recv`, out of messages that are there already."""
+    with can.Bus(
+        interface="cantap", channel="virtual:pace=fast,load=100,channels=1", bitrate=1_000_000, listen_only=True
+    ) as bus:
+        while bus.recv(1) is None:
+            pass
+        time.sleep(3)
+        begin = time.perf_counter()
+        for _ in range(messages):
+            if bus.recv(1) is None:
+                raise RuntimeError("there were fewer messages")
+        return messages / (time.perf_counter() - begin)
+
+
+def message_alone(messages):
+    """Messages per second of python-can's constructor."""
+    data = bytes(8)
+    begin = time.perf_counter()
+    for _ in range(messages):
+        can.Message(1.7e9, 0x123, False, False, False, 0, 8, data, False, True)
+    return messages / (time.perf_counter() - begin)
+
+
+def virtual_loop(messages):
+    """Messages per second of `can.Bus.recv` on python-can's own virtual interface."""
+    with can.Bus(interface="virtual", channel="a") as sender, can.Bus(interface="virtual", channel="a") as bus:
+        message = can.Message(arbitration_id=0x123, data=bytes(8), is_extended_id=False)
+        for _ in range(messages):
+            sender.send(message)
+        begin = time.perf_counter()
+        for _ in range(messages):
+            bus.recv(1)
+        return messages / (time.perf_counter() - begin)
+
+
+def capture(seconds):
+    """Records per second in tables, out of a device that is faster than any bus."""
+    with cantap.open("virtual:pace=fast,load=100", 1_000_000) as device:
+        begin, records = time.perf_counter(), 0
+        while (passed := time.perf_counter() - begin) < seconds:
+            records += len(device.batch(seconds=0.2))
+        lost = sum(counts["lost"] for counts in device.losses.values()) + sum(device._records.lost)
+        return records / passed, lost
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=200_000)
+    parser.add_argument("--runs", type=int, default=3)
+    arguments = parser.parse_args()
+    frames, runs = arguments.frames, arguments.runs
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        make(folder, frames)
+        blf, mf4 = folder / "drive.blf", folder / "drive.mf4"
+        database = cantap.load_database(CAR)
+        rows = []
+
+        def row(what, theirs, theirs_s, ours_s):
+            rows.append((what, theirs, theirs_s, ours_s))
+            print(f"| {what} | {theirs} | {theirs_s:.3f} | {ours_s:.4f} | {theirs_s / ours_s:.0f} × |", flush=True)
+
+        print(f"{frames} frames\n\n| what | beside | its time in s | ours in s | |\n|---|---|---|---|---|")
+        theirs, counted = best(lambda: read_with_python_can(blf), 1)
+        ours, table = best(lambda: cantap.read(blf), runs)
+        if counted != len(table) != frames:
+            raise RuntimeError("not the same frames")
+        row("read BLF", "python-can", theirs, ours)
+        theirs, values = best(lambda: decode_with_cantools(blf), 1)
+        ours, decoded = best(lambda: cantap.decode(blf, database), runs)
+        if decoded.report.values != values:
+            raise RuntimeError(f"{decoded.report.values} values here, {values} there")
+        row("BLF to a column per signal", "python-can + cantools", theirs, ours)
+        ours, _ = best(lambda: cantap.read(blf, db=database), runs)
+        row("BLF to a row per value", "python-can + cantools", theirs, ours)
+        theirs, _ = best(lambda: decode_with_asammdf(mf4), 1)
+        ours, _ = best(lambda: cantap.decode(mf4, database), runs)
+        row("MF4 to a column per signal", "asammdf extract_bus_logging", theirs, ours)
+    print("\n| messages per second | |\n|---|---|")
+    print(f"| `can.Bus.recv`, cantap | {recv_loop(100_000):,.0f} |")
+    print(f"| `can.Bus.recv`, python-can's virtual interface | {virtual_loop(100_000):,.0f} |")
+    print(f"| python-can's `Message` alone | {message_alone(100_000):,.0f} |")
+    rate, lost = capture(3)
+    print(f"| `device.batch` (records; {lost} lost, counted) | {rate:,.0f} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+//! Columns as NumPy takes them: bytes of one type, and which rows have a value.
+
+use arrow_array::cast::AsArray;
+use arrow_array::types::{
+    Float64Type, Int8Type, Int32Type, TimestampNanosecondType, UInt8Type, UInt32Type, UInt64Type,
+};
+use arrow_array::{Array, ArrowPrimitiveType, BinaryArray, StringArray};
+use arrow_schema::DataType;
+use pyo3::prelude::*;
+use pyo3::types::PyBytes;
+
+use crate::error::Error;
+
+/// Type in NumPy's words, bytes, the mask of rows without a value if there are any, texts that the numbers stand for, bytes per row.
+pub type Parts<'py> =
+    (&'static str, Bound<'py, PyBytes>, Option<Bound<'py, PyBytes>>, Option<Vec<String>>, usize);
+
+/// A column's parts.
+pub fn parts<'py>(py: Python<'py>, column: &dyn Array) -> Result<Parts<'py>, Error> {
+    let mask = (column.null_count() > 0).then(|| {
+        let missing: Vec<u8> = (0..column.len()).map(|row| u8::from(column.is_null(row))).collect();
+        PyBytes::new(py, &missing)
+    });
+    let numbers = |kind, bytes: &[u8], size| Ok((kind, PyBytes::new(py, bytes), mask.clone(), None, size));
+    match column.data_type() {
+        DataType::Timestamp(..) => numbers("datetime64[ns]", &bytes::<TimestampNanosecondType>(column), 8),
+        DataType::UInt8 => numbers("uint8", &bytes::<UInt8Type>(column), 1),
+        DataType::UInt32 => numbers("uint32", &bytes::<UInt32Type>(column), 4),
+        DataType::UInt64 => numbers("uint64", &bytes::<UInt64Type>(column), 8),
+        DataType::Float64 => numbers("float64", &bytes::<Float64Type>(column), 8),
+        DataType::Boolean => {
+            let values: Vec<u8> = column.as_boolean().values().iter().map(u8::from).collect();
+            numbers("bool", &values, 1)
+        }
+        DataType::Binary => {
+            let (rows, width) = padded(column.as_binary());
+            numbers("uint8", &rows, width)
+        }
+        DataType::Dictionary(key, _) => {
+            let dictionary = column.as_any_dictionary();
+            let texts: &StringArray = dictionary.values().as_string();
+            let texts = texts.iter().map(|text| text.unwrap_or_default().to_owned()).collect();
+            let (kind, bytes, size) = match **key {
+                DataType::Int8 => ("int8", bytes::<Int8Type>(dictionary.keys()), 1),
+                _ => ("int32", bytes::<Int32Type>(dictionary.keys()), 4),
+            };
+            Ok((kind, PyBytes::new(py, &bytes), mask, Some(texts), size))
+        }
+        other => Err(Error::Format(format!("a column of {other} is none of NumPy's"))),
+    }
+}
+
+fn bytes<T: ArrowPrimitiveType>(column: &dyn Array) -> Vec<u8> {
+    let values = column.as_primitive::<T>();
+    values.values().inner().as_slice().to_vec()
+}
+
+/// Rows of one width, with zeros behind shorter ones.
+fn padded(column: &BinaryArray) -> (Vec<u8>, usize) {
+    let width = column.iter().flatten().map(<[u8]>::len).max().unwrap_or(0);
+    let mut rows = vec![0; width * column.len()];
+    for (row, bytes) in column.iter().enumerate() {
+        let bytes = bytes.unwrap_or_default();
+        rows[row * width..row * width + bytes.len()].copy_from_slice(bytes);
+    }
+    (rows, width)
+}

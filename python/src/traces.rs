@@ -1,0 +1,365 @@
+//! What is done with a whole trace.
+
+use std::collections::{HashMap, HashSet};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+use std::{fs, io};
+
+use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
+use arrow_schema::{DataType, Field, Schema};
+use cantap_analysis::stats::{Options as StatOptions, Statistics};
+use cantap_columns::parquet::ParquetFile;
+use cantap_columns::{FrameColumns, MessageColumns};
+use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
+use cantap_signals::condition::Condition;
+use cantap_signals::search::{DataPattern, IdPattern, Search};
+use cantap_signals::{Decoder, Message, MessageRef, Selection, SignalValue};
+use pyo3::prelude::*;
+
+use crate::database::Database;
+use crate::error::Error;
+use crate::report::{Report, by_kind, from_json};
+use crate::scan::warn;
+use crate::source::{Options, TraceSource};
+use crate::table::{Table, batches_of};
+
+/// Goes through a trace; Ctrl-C ends it.
+fn walk(
+    py: Python<'_>,
+    options: &Options,
+    report: &Report,
+    mut each: impl FnMut(&cantap::TraceRecord, &mut TraceSource) -> Result<(), Error> + Send,
+) -> PyResult<()> {
+    let for_source = report.clone();
+    let mut source = py.detach(|| TraceSource::open(options, for_source))?;
+    let mut records = Vec::new();
+    while py.detach(|| -> Result<bool, Error> {
+        let more = source.next_batch(&mut records)?;
+        records.iter().try_for_each(|record| each(record, &mut source))?;
+        Ok(more)
+    })? {
+        py.check_signals()?;
+    }
+    source.tell();
+    warn(py, report)
+}
+
+/// Statistics of a trace, as `cantap stats --json` has them.
+#[pyfunction]
+pub fn stats<'py>(
+    py: Python<'py>,
+    options: Options,
+    bitrates: Vec<(Option<u8>, u32)>,
+    data_bitrates: Vec<(Option<u8>, u32)>,
+    window_s: f64,
+) -> PyResult<Bound<'py, PyAny>> {
+    let all = |rates: &[(Option<u8>, u32)]| {
+        rates.iter().find(|(channel, _)| channel.is_none()).map(|(_, rate)| *rate)
+    };
+    let of_channels = |rates: &[(Option<u8>, u32)]| {
+        rates.iter().filter_map(|(channel, rate)| Some(((*channel)?, *rate))).collect::<Vec<_>>()
+    };
+    let window = Duration::try_from_secs_f64(window_s);
+    let window = window.map_err(|_| Error::argument(format!("{window_s} s is no length of a window")))?;
+    let statistics = Statistics::new(StatOptions {
+        bitrate_bps: all(&bitrates),
+        channel_bitrate_bps: of_channels(&bitrates),
+        data_bitrate_bps: all(&data_bitrates),
+        channel_data_bitrate_bps: of_channels(&data_bitrates),
+        window,
+        ..StatOptions::default()
+    });
+    let mut statistics = statistics.map_err(Error::argument)?;
+    let report = Report::default();
+    walk(py, &options, &report, |record, _| {
+        statistics.push(record);
+        Ok(())
+    })?;
+    statistics.finish();
+    let mut summary = serde_json::to_value(statistics.summary()).unwrap_or_default();
+    let counts = report.now();
+    summary["issues"] = counts.issues.into();
+    summary["left_out"] = serde_json::to_value(&counts.left_out).unwrap_or_default();
+    summary["missing_pct"] = counts.missing_pct().into();
+    from_json(py, &summary.to_string())
+}
+
+/// Records that become a table for each message, and one of what happened beside frames.
+struct PerMessage {
+    decoder: Arc<Decoder>,
+    /// Of chosen signals only: a message without any of them counts for nothing.
+    chosen: Option<Selection>,
+    tables: HashMap<MessageRef, MessageColumns>,
+    events: FrameColumns,
+    values: Vec<SignalValue>,
+}
+
+/// What Python's half makes a mapping of: tables by name, and the events.
+type Tables = (Vec<(String, Table)>, Table);
+
+impl PerMessage {
+    fn new(decoder: Arc<Decoder>, signals: &[String]) -> Result<Self, Error> {
+        let chosen = if signals.is_empty() { None } else { Some(Selection::new(signals)?) };
+        let events = FrameColumns::default();
+        Ok(Self { decoder, chosen, tables: HashMap::new(), events, values: Vec::new() })
+    }
+
+    /// Appends a record; returns how many values it has, if it is a frame of a message.
+    fn push(&mut self, record: &cantap::TraceRecord) -> Option<usize> {
+        let Self { decoder, chosen, tables, events, values } = self;
+        let Some(frame) = record.frame() else {
+            events.push(record);
+            return None;
+        };
+        let reference = decoder.decode(record.channel, frame, values)?;
+        if values.is_empty() && chosen.is_some() {
+            return None;
+        }
+        let message = decoder.message(reference);
+        tables.entry(reference).or_insert_with(|| MessageColumns::new(message)).push(message, record, values);
+        Some(values.len())
+    }
+
+    fn finish(mut self) -> Tables {
+        (named(&self.decoder, self.tables, self.chosen.as_ref()), Table::of_batch(self.events.take()))
+    }
+}
+
+/// A trace as a table for each message, and one of what happened beside frames.
+#[pyfunction]
+pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
+    let decoder =
+        options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
+    let mut tables = PerMessage::new(decoder, &options.signals)?;
+    let report = Report::default();
+    walk(py, &options, &report, |record, source| {
+        if let Some(values) = tables.push(record) {
+            source.counts.decoded += 1;
+            source.counts.values += values as u64;
+        }
+        Ok(())
+    })?;
+    Ok((tables.finish(), Py::new(py, report)?))
+}
+
+/// The same of a table of records.
+#[pyfunction]
+pub fn decode_table(
+    py: Python<'_>,
+    table: &Bound<'_, PyAny>,
+    db: Py<Database>,
+    signals: Vec<String>,
+) -> PyResult<Tables> {
+    let mut tables = PerMessage::new(db.get().selecting(&signals)?, &signals)?;
+    for batch in batches_of(table)? {
+        py.detach(|| -> Result<(), Error> {
+            for record in records_of(batch)? {
+                tables.push(&record);
+            }
+            Ok(())
+        })?;
+        py.check_signals()?;
+    }
+    Ok(tables.finish())
+}
+
+/// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
+fn named(
+    decoder: &Decoder,
+    mut tables: HashMap<MessageRef, MessageColumns>,
+    chosen: Option<&Selection>,
+) -> Vec<(String, Table)> {
+    let mut named: Vec<(String, Table)> = Vec::new();
+    for (reference, channel, message) in decoder.messages() {
+        let Some(mut table) = tables.remove(&reference) else { continue };
+        let mut name = message.name.clone();
+        if named.iter().any(|(other, _)| *other == name) {
+            name = format!("{name}-{}", message.id);
+        }
+        if let Some(channel) = channel.filter(|_| named.iter().any(|(other, _)| *other == name)) {
+            name = format!("{name}-{channel}");
+        }
+        let batch = table.take();
+        let batch = chosen.map_or_else(|| batch.clone(), |chosen| only(&batch, message, chosen));
+        named.push((name, Table::of_batch(batch)));
+    }
+    named
+}
+
+/// The columns of time, channel and identifier, and those of the chosen signals.
+fn only(batch: &RecordBatch, message: &Message, chosen: &Selection) -> RecordBatch {
+    let left_out: HashSet<_> = message
+        .signals
+        .iter()
+        .filter(|signal| !chosen.matches(message, signal))
+        .flat_map(|signal| [signal.label().into_owned(), format!("{}.text", signal.label())])
+        .collect();
+    let schema = batch.schema();
+    let kept: Vec<_> = (0..schema.fields().len())
+        .filter(|at| *at < 3 || !left_out.contains(schema.field(*at).name()))
+        .collect();
+    // Cannot fail: all of these are there.
+    batch.project(&kept).unwrap_or_else(|_| batch.clone())
+}
+
+/// The records that are looked for, each with its place in the trace.
+#[pyfunction]
+pub fn search(
+    py: Python<'_>,
+    options: Options,
+    condition: Option<String>,
+    ids: Vec<String>,
+    data: Vec<String>,
+    max_count: Option<u64>,
+) -> PyResult<Table> {
+    let decoder = options.decoder()?.unwrap_or_else(|| Arc::new(Decoder::new(Vec::new())));
+    let condition = condition.map(|text| Condition::new(&text, &decoder)).transpose().map_err(Error::from)?;
+    let ids = ids
+        .iter()
+        .map(|text| text.parse())
+        .collect::<Result<Vec<IdPattern>, _>>()
+        .map_err(Error::argument)?;
+    let data = data.iter().map(|text| text.parse()).collect::<Result<Vec<DataPattern>, _>>();
+    let data = data.map_err(Error::argument)?;
+    if condition.is_none() && ids.is_empty() && data.is_empty() {
+        return Err(Error::argument("nothing to look for; give a condition, id= or data=").into());
+    }
+    let mut search = Search { ids, data, condition };
+    let (mut found, mut places) = (FrameColumns::default(), Vec::new());
+    let mut place = 0_u64;
+    let report = Report::default();
+    walk(py, &options, &report, |record, _| {
+        let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most);
+        if search.finds(record) && is_wanted {
+            found.push(record);
+            places.push(place);
+        }
+        place += 1;
+        Ok(())
+    })?;
+    let batch = found.take();
+    let mut fields: Vec<_> = batch.schema().fields().iter().cloned().collect();
+    fields.push(Arc::new(Field::new("place", DataType::UInt64, false)));
+    let mut columns = batch.columns().to_vec();
+    columns.push(Arc::new(UInt64Array::from(places)) as ArrayRef);
+    let schema = Arc::new(Schema::new(fields));
+    let batch = RecordBatch::try_new(Arc::clone(&schema), columns)
+        .map_err(|error| Error::Format(error.to_string()))?;
+    Ok(Table::new(schema, vec![batch], Some(Py::new(py, report)?)))
+}
+
+/// The columns of a table of records, without rows.
+#[pyfunction]
+pub fn no_records() -> Table {
+    Table::of_batch(FrameColumns::default().take())
+}
+
+/// Writes a table of records as a trace. An older file of its name stays as it is until this one is whole.
+#[pyfunction]
+pub fn write<'py>(
+    py: Python<'py>,
+    table: &Bound<'py, PyAny>,
+    path: PathBuf,
+    format: Option<String>,
+    zone: Option<String>,
+) -> PyResult<Bound<'py, PyAny>> {
+    let batches = batches_of(table)?;
+    // Before anything is created; a table without rows must be one of records, too.
+    cantap_columns::records(&RecordBatch::new_empty(batches.schema())).map_err(Error::from)?;
+    let is_parquet = path.extension().is_some_and(|suffix| suffix.eq_ignore_ascii_case("parquet"));
+    let left_out = py.detach(|| -> Result<_, Error> {
+        if is_parquet && format.is_none() {
+            return write_parquet(batches, &path);
+        }
+        let options = WriteOptions {
+            format: format.as_deref().map(str::parse).transpose().map_err(Error::argument)?,
+            zone: zone.as_deref().map(str::parse).transpose().map_err(Error::argument)?.unwrap_or_default(),
+            ..WriteOptions::default()
+        };
+        write_trace(batches, &path, options)
+    })?;
+    let counts = serde_json::to_string(&by_kind(&left_out)).unwrap_or_default();
+    from_json(py, &counts)
+}
+
+fn records_of(
+    batch: Result<RecordBatch, arrow_schema::ArrowError>,
+) -> Result<Vec<cantap::TraceRecord>, Error> {
+    let batch = batch.map_err(|error| Error::Format(error.to_string()))?;
+    Ok(cantap_columns::records(&batch)?)
+}
+
+fn write_parquet(batches: Box<dyn RecordBatchReader + Send>, path: &Path) -> Result<LeftOut, Error> {
+    let mut file = ParquetFile::create(path, FrameColumns::default())?;
+    for batch in batches {
+        for record in records_of(batch)? {
+            file.table.push(&record);
+        }
+        file.flush()?;
+    }
+    file.finish()?;
+    Ok(LeftOut::default())
+}
+
+fn write_trace(
+    batches: Box<dyn RecordBatchReader + Send>,
+    path: &Path,
+    mut options: WriteOptions,
+) -> Result<LeftOut, Error> {
+    let failed = |error: io::Error| match error.kind() {
+        // No format of the name, or one that is only read.
+        io::ErrorKind::InvalidInput | io::ErrorKind::Unsupported => Error::Format(error.to_string()),
+        _ => Error::of_file(error, path),
+    };
+    if options.format.is_none() {
+        options.format =
+            Some(cantap_formats::Format::of_path(path).map_err(|error| Error::Format(error.to_string()))?);
+    }
+    // A pipe or a device is written itself.
+    let is_file = !path.exists() || path.is_file();
+    let temporary = if is_file { Temporary::beside(path).map_err(failed)? } else { None };
+    let written = temporary.as_ref().map_or(path, |temporary| &temporary.0);
+    let mut writer: Box<dyn TraceWriter> = create_writer(written, &options).map_err(failed)?;
+    for batch in batches {
+        for record in records_of(batch)? {
+            writer.write(&record).map_err(failed)?;
+        }
+    }
+    let left_out = writer.finish().map_err(failed)?;
+    if let Some(temporary) = &temporary {
+        // A link stays a link.
+        let place = path.canonicalize().unwrap_or_else(|_| path.to_owned());
+        fs::rename(&temporary.0, place).map_err(failed)?;
+    }
+    Ok(left_out)
+}
+
+/// A file that is removed if it is still there at the end. It ends like the other, so that it has its format and compression.
+struct Temporary(PathBuf);
+
+impl Temporary {
+    fn beside(path: &Path) -> io::Result<Option<Self>> {
+        let place = if path.exists() { path.canonicalize()? } else { path.to_owned() };
+        let Some(name) = place.file_name() else { return Ok(None) };
+        let mut temporary = std::ffi::OsString::from(format!(".cantap-{}-", std::process::id()));
+        temporary.push(name);
+        Ok(Some(Self(place.with_file_name(temporary))))
+    }
+}
+
+impl Drop for Temporary {
+    fn drop(&mut self) {
+        let _ = fs::remove_file(&self.0);
+    }
+}
+
+/// Adds the functions to the module.
+pub fn register(module: &Bound<'_, PyModule>) -> PyResult<()> {
+    module.add_function(wrap_pyfunction!(decode, module)?)?;
+    module.add_function(wrap_pyfunction!(decode_table, module)?)?;
+    module.add_function(wrap_pyfunction!(no_records, module)?)?;
+    module.add_function(wrap_pyfunction!(search, module)?)?;
+    module.add_function(wrap_pyfunction!(stats, module)?)?;
+    module.add_function(wrap_pyfunction!(write, module)?)
+}

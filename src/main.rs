@@ -296,11 +296,18 @@ mod app {
         let tim7::SharedResources { mut tap, session, usb, controls, .. } = cx.shared;
         cx.local.tick.acknowledge();
         cx.local.watchdog.feed();
-        // One short lock each, so that the transmission alarm can come between them.
+        // Short locks, so that the transmission alarm can come between them: it is 14 µs early, and a lock, a drain and its own
+        // work have to fit.
         for channel in Channel::ALL {
-            tap.lock(|Tap { capture, traffic, alarm }| {
-                capture.on_channel_tick(channel, &mut traffic[channel.index()], alarm);
+            let is_open = tap.lock(|Tap { capture, traffic, alarm }| {
+                capture.on_tick_errors(channel, &mut traffic[channel.index()], alarm)
             });
+            if is_open {
+                tap.lock(|Tap { capture, traffic, alarm }| {
+                    capture.on_tick_queues(channel, &mut traffic[channel.index()], alarm);
+                });
+                tap.lock(|Tap { capture, alarm, .. }| capture.arm(alarm));
+            }
         }
         let activity = tap.lock(|Tap { capture, .. }| capture.take_activity());
         controls.chip.tick(activity);

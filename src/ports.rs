@@ -157,13 +157,27 @@ pub trait Chip {
     fn load(&mut self, out: &mut [u8]) -> usize;
 }
 
+/// What a host has done with a port, in numbers that wrap: a change is what counts.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct PortHistory {
+    /// How often it was opened. A host that has configured the device anew and then opens the port opens it again.
+    pub opened: u8,
+    /// How often the device was configured anew with the port open, or its configuration taken away.
+    pub configured: u8,
+}
+
 /// The USB port's data pipes.
 pub trait Port {
     /// Whether a host has the port open.
     fn is_open(&self) -> bool;
-    /// Whether the host has put the bus to sleep with the port open. It is not open meanwhile, and is again when the bus wakes.
+    /// Whether the host has put the bus to sleep, or taken the device's configuration away, with the port open. It is not open
+    /// meanwhile, and is again afterwards.
     fn is_suspended(&self) -> bool {
         false
+    }
+    /// What the host has done with the port so far.
+    fn history(&self) -> PortHistory {
+        PortHistory::default()
     }
     /// Hands over as many of these bytes as go in one transfer and returns how many: all of them, or whole packets of [`PACKET`].
     /// `None` if the last transfer is still under way. No bytes are an empty packet.

@@ -452,3 +452,122 @@ fn what_was_kept_for_a_sleeping_host_goes_with_it() {
     let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
     assert_eq!((status.queue_bytes, status.channels[0].open), (0, None));
 }
+
+/// A client whose host configured the device anew still has the port open, and may never have been told: when it asks for something, it
+/// gets what was captured, why there is no more, and the refusal, in this order.
+#[test]
+fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_asks() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::Normal);
+    bench.port.takes = 0;
+    for number in 0..400 {
+        bench.receive(Channel::ALL[number as usize % 2], numbered(number));
+        bench.pass(1000);
+    }
+    bench.millisecond();
+    bench.port.history.configured += 1;
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    assert!(bench.board.control.iter().all(|control| !control.running));
+    let left_at = u64::from(bench.board.clock.now.get());
+    let sent = bench.port.from_device.len();
+    for _ in 0..100 {
+        bench.millisecond();
+    }
+    assert_eq!(bench.port.from_device.len(), sent, "it may be another program that listens");
+
+    // In one packet each, so that the first answer is handed over before the rest is read.
+    bench.say(&encode(&Request { id: 900, command: Command::Time }));
+    let early: Vec<u16> = bench.responses.iter().map(|response| response.id).collect();
+    assert!(bench.ends.len() == 1 || early.is_empty(), "a refusal before the end ends the client's reading");
+    bench.say(&encode(&Request { id: 901, command: Command::Status }));
+    for _ in 0..5 {
+        bench.millisecond();
+    }
+    assert_eq!((bench.frames(CAN1).len(), bench.frames(CAN2).len()), (200, 200));
+    assert_eq!(bench.events(), [Event::Stopped { channel: CAN1 }, Event::Stopped { channel: CAN2 }]);
+    let [(ended_at, EndReason::Configured)] = bench.ends[..] else { panic!("{:?}", bench.ends) };
+    assert!(ended_at.abs_diff(left_at) <= u64::from(TICK_HZ / 1000), "{ended_at} is not {left_at}");
+    let refused = |id| Response { id, result: Err(Refusal::NoSession) };
+    assert_eq!(bench.responses, [refused(900), refused(901)]);
+    assert!(bench.complaints.is_empty(), "{:?}", bench.complaints);
+
+    // On the same port it may begin again.
+    bench.records.clear();
+    bench.greet();
+    bench.ask(Command::Open { channel: CAN1, config: Some(config(Mode::ListenOnly)) }).unwrap();
+    bench.receive(CAN1, numbered(4));
+    bench.millisecond();
+    bench.millisecond();
+    assert_eq!(bench.frames(CAN1), [numbered(4)]);
+}
+
+/// Refusals that overtake the rest of a session would end the client's reading before it.
+#[test]
+fn no_refusal_overtakes_what_a_session_that_ended_still_has_to_say() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.port.takes = 0;
+    for number in 0..1200 {
+        bench.receive(CAN1, numbered(number));
+        bench.pass(1000);
+    }
+    bench.sleep(true);
+    bench.millisecond();
+    bench.sleep(false);
+    bench.say(&encode(&Request { id: 900, command: Command::Time }));
+    while bench.ends.is_empty() {
+        // One transfer at a time.
+        bench.port.takes = 1;
+        bench.millisecond();
+        assert!(bench.responses.is_empty() || !bench.ends.is_empty(), "after {} frames", bench.records.len());
+    }
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    assert_eq!(bench.responses, [Response { id: 900, result: Err(Refusal::NoSession) }]);
+    assert_eq!(bench.frames(CAN1).len(), 1200);
+}
+
+/// Whoever opens the port after a new configuration, or greets the device, is another: it gets nothing of the session before.
+#[test]
+fn what_was_left_when_the_device_was_configured_anew_is_not_for_the_next_program() {
+    for opens in [true, false] {
+        let queue = RecordQueue::<SMALL_QUEUE>::new();
+        let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+        bench.port.takes = 0;
+        bench.receive(CAN1, numbered(1));
+        bench.millisecond();
+        bench.port.history.configured += 1;
+        bench.millisecond();
+        bench.port.history.opened += u8::from(opens);
+        bench.port.takes = usize::MAX;
+        bench.millisecond();
+        bench.greet();
+        let Ok(Reply::Status(status)) = bench.ask(Command::Status) else { panic!() };
+        assert_eq!((status.queue_bytes, status.channels[0].open), (0, None));
+        assert!(bench.records.is_empty() && bench.ends.is_empty(), "opens: {opens}");
+    }
+}
+
+/// No configuration, no endpoints: what is left waits for them.
+#[test]
+fn what_is_left_outlives_a_time_without_a_configuration() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::opened(&queue, Mode::ListenOnly);
+    bench.port.takes = 0;
+    bench.receive(CAN1, numbered(1));
+    bench.port.history.configured += 1;
+    bench.sleep(true);
+    for _ in 0..20 {
+        bench.millisecond();
+    }
+    assert!(bench.board.control.iter().all(|control| !control.running));
+    bench.port.history.configured += 1;
+    bench.sleep(false);
+    bench.port.takes = usize::MAX;
+    bench.millisecond();
+    assert!(bench.records.is_empty());
+    assert_eq!(bench.ask(Command::Time), Err(Refusal::NoSession));
+    assert_eq!(bench.frames(CAN1), [numbered(1)]);
+    assert!(matches!(bench.ends[..], [(_, EndReason::Configured)]), "{:?}", bench.ends);
+}

@@ -446,3 +446,21 @@ fn a_host_that_wakes_gets_what_was_captured_and_a_bel() {
     assert_eq!(bench.port.from_device[before..], *b"t123111\r\x07");
     converse(&mut bench, &[("t1230", "\x07"), ("O", "\r")]);
 }
+
+/// What is said behind the rest of the session is the answer to the line that asked for it.
+#[test]
+fn a_program_whose_host_configured_the_device_anew_gets_the_rest_when_it_says_something() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S6", "\r"), ("O", "\r")]);
+    bench.board.traffic[0].arrive("123#11".parse().unwrap());
+    bench.interrupt(CAN1);
+    bench.port.history.configured += 1;
+    let before = bench.port.from_device.len();
+    for _ in 0..3 {
+        bench.millisecond();
+    }
+    assert!(!bench.board.control[0].running);
+    assert_eq!(bench.port.from_device.len(), before, "it may be another program that listens");
+    converse(&mut bench, &[("t1230", "t123111\r\x07"), ("t1230", "\x07"), ("O", "\r")]);
+}

@@ -9,6 +9,8 @@ use cantap::wire::Refusal;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
+use crate::server::Server;
+
 /// Where nothing could be read.
 const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
 
@@ -44,6 +46,9 @@ fn of_device(error: &DeviceError) -> Option<String> {
         DeviceError::Open { .. } => "; check the address with `cantap list`",
         DeviceError::NotCantap { .. } => {
             "; check that it is one (`cantap list`), then unplug it and plug it in again"
+        }
+        DeviceError::Vanished { address, .. } if Server::is_meant(address) => {
+            "; its server has ended, or does not let this client in"
         }
         DeviceError::Vanished { .. } => "; plug it in again",
         DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",

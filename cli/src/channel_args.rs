@@ -252,6 +252,17 @@ impl ChannelArgs {
     }
 }
 
+/// How a channel is open, in words.
+pub fn description(config: &ChannelConfig, can_clock_hz: u32) -> String {
+    let mode = match config.mode {
+        Mode::ListenOnly => "listening only",
+        Mode::Normal => "taking part",
+        Mode::Loopback => "in loopback",
+        Mode::SilentLoopback => "in silent loopback",
+    };
+    format!("{} bit/s, {mode}", config.timing.bitrate_bps(can_clock_hz))
+}
+
 /// The mode as `--mode` takes it.
 pub const fn mode_name(mode: Mode) -> &'static str {
     match mode {

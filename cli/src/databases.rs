@@ -12,8 +12,8 @@ use crate::completion;
 /// Which databases; for commands to flatten into theirs.
 #[derive(Clone, clap::Args)]
 pub struct DatabaseArgs {
-    /// A database: a DBC file or a .toml signal file; with a channel before it (2:FILE) it is that
-    /// channel's only one, without it serves all others. Can be repeated.
+    /// A database: DBC, KCD, SYM, ARXML or a .toml signal file; with a channel before it (2:FILE) it is that
+    /// channel's only one, without it serves all others. FILE#BUS is one bus of a KCD or ARXML file. Can be repeated.
     #[arg(long = "db", value_name = "[CHANNEL:]FILE", add = completion::databases())]
     databases: Vec<DatabasePath>,
     /// Take all 29-bit messages for J1939 parameter groups, even if the database does not say so.

@@ -8,10 +8,11 @@ use anyhow::anyhow;
 use cantap::TraceRecord;
 use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
 use cantap::wire::message::{ChannelConfig, Mode};
+use cantap_formats::ChannelInfo;
 
 use crate::address::{Address, OpenDevice};
 use crate::boards::{Boards, filters_on, place_of};
-use crate::channel_args::ChannelArgs;
+use crate::channel_args::{self, ChannelArgs};
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::hearing::{self, Hearing};
@@ -68,7 +69,11 @@ pub struct LiveRecords {
     hearing: Hearing,
     /// Frames may be there although none is heard, so that silence says nothing.
     is_filtered: bool,
+    /// Takes what happens, instead of standard error.
+    reporter: Option<Reporter>,
 }
+
+type Reporter = Box<dyn FnMut(&str)>;
 
 impl LiveArgs {
     /// The devices that were given.
@@ -122,7 +127,21 @@ impl LiveRecords {
             stopped: None,
             hearing: Hearing::default(),
             is_filtered: !filters.is_empty(),
+            reporter: None,
         })
+    }
+
+    /// Reports what happens to devices and channels there, instead of on standard error.
+    pub fn report_to(&mut self, reporter: impl FnMut(&str) + 'static) {
+        self.reporter = Some(Box::new(reporter));
+    }
+
+    fn report(&mut self, text: &str) {
+        if let Some(reporter) = &mut self.reporter {
+            reporter(text);
+        } else {
+            eprintln!("cantap: {text}");
+        }
     }
 
     /// Ends with an error when every device has been away for this long.
@@ -148,6 +167,21 @@ impl LiveRecords {
             let opened = device.open_channels().into_iter();
             opened.map(move |(channel, config)| (channel_number(board, channel), config, clock_hz))
         })
+    }
+
+    /// The channels that are open, as files can describe them.
+    pub fn channels(&self) -> Vec<ChannelInfo> {
+        let info = |(number, config, clock_hz): (u8, ChannelConfig, u32)| {
+            let (board, channel) = place_of(number);
+            let address = self.addresses.get(board).map(ToString::to_string).unwrap_or_default();
+            let how = channel_args::description(&config, clock_hz);
+            ChannelInfo {
+                channel: number,
+                bitrate_bps: Some(config.timing.bitrate_bps(clock_hz)),
+                description: format!("channel {} of {address}, {how}", channel.number()),
+            }
+        };
+        self.opened().map(info).collect()
     }
 
     /// Their addresses.
@@ -227,12 +261,13 @@ impl LiveRecords {
                     ),
                     None => "it goes on when the device is back, and Ctrl-C ends it".to_owned(),
                 };
-                eprintln!("cantap: {reason}; {rest}");
+                self.report(&format!("{reason}; {rest}"));
             }
             Happening::Gone(error) => return Err(error),
             Happening::Back(back) => {
                 let name = (self.addresses.len() > 1).then(|| &self.addresses[board]);
-                eprintln!("cantap: {}", welcome(board, name, &back));
+                let said = welcome(board, name, &back);
+                self.report(&said);
             }
             Happening::Ended => {
                 records.clear();
@@ -250,7 +285,11 @@ impl LiveRecords {
         let now = Instant::now();
         self.hearing.take(records, now);
         for number in self.hearing.news(now) {
-            stderr::warn(&self.errors_only(number));
+            let said = self.errors_only(number);
+            match &mut self.reporter {
+                Some(reporter) => reporter(&said),
+                None => stderr::warn(&said),
+            }
         }
     }
 }
@@ -261,7 +300,7 @@ pub fn unasked(error: anyhow::Error, given: &[Address], without: &str) -> anyhow
 }
 
 /// What there is to say of a device that is there again, with its name if there are several.
-fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
+pub fn welcome(board: usize, name: Option<&Address>, back: &Return) -> String {
     let after = back.after.unwrap_or_default().as_secs_f64();
     let at = name.map_or_else(String::new, |name| format!(" at '{name}'"));
     let mut said = match &back.other_board {

@@ -38,6 +38,11 @@ impl Losses {
         }
     }
 
+    /// At all stages.
+    pub const fn total(&self) -> u64 {
+        self.controller + self.queue + self.link + self.host
+    }
+
     /// One line.
     pub fn line(&self) -> String {
         let Self { controller, queue, link, host } = self;

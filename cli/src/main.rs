@@ -43,10 +43,12 @@ mod meter;
 mod missing;
 mod monitor;
 mod progress;
+mod protocols;
 mod rescue;
 mod sending;
 mod server;
 mod shells;
+mod speaking;
 mod stderr;
 mod timing_args;
 mod trace_output;
@@ -77,7 +79,8 @@ struct Cli {
 fn main() -> ExitCode {
     // A shell asks, and the program ends here.
     CompleteEnv::with_factory(Cli::command).var(shells::VARIABLE).shells(shells::ALL).complete();
-    let cli = Cli::try_parse().unwrap_or_else(|error| leave(&error));
+    let arguments = commands::extcap::arguments(std::env::args_os());
+    let cli = Cli::try_parse_from(arguments).unwrap_or_else(|error| leave(&error));
     match cli.command.run(Cli::command()) {
         Ok(code) => code,
         // `cantap … | head` has read what it wanted.

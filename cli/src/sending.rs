@@ -6,13 +6,13 @@ use std::io::Write;
 use std::time::Duration;
 
 use anyhow::bail;
-use cantap::Device;
 use cantap::device::Transmission;
 use cantap::replay::Replay;
 use cantap::transmit::Stream;
 use cantap::unsent::{Cause, PATIENCE, Watch};
 use cantap::wire::record::TransmitFailure;
 use cantap::wire::{CHANNELS, Channel};
+use cantap::{Device, TraceRecord};
 
 use crate::interrupt;
 use crate::rescue::Rescue;
@@ -41,9 +41,13 @@ pub struct Sending<'d> {
 impl<'d> Sending<'d> {
     /// Nothing sent yet. Prints nothing if `quiet`.
     pub fn new(device: &'d Device, rescue: Rescue, quiet: bool) -> Self {
+        Self::over(device, Watch::new(device, rescue.is_on_duty()), rescue, quiet)
+    }
+
+    const fn over(device: &'d Device, watch: Watch<'d>, rescue: Rescue, quiet: bool) -> Self {
         Self {
             device,
-            watch: Watch::new(device, rescue.is_on_duty()),
+            watch,
             rescue,
             quiet,
             sent: 0,
@@ -53,6 +57,16 @@ impl<'d> Sending<'d> {
             stands_still: false,
             error: None,
         }
+    }
+
+    /// The same for a command that uses the device's records itself, and hands each of them to [`Self::take`]. Prints nothing.
+    pub fn fed(device: &'d Device, rescue: Rescue) -> Self {
+        Self::over(device, Watch::fed(device, rescue.is_on_duty()), rescue, true)
+    }
+
+    /// Takes notice of what was on the bus.
+    pub fn take(&mut self, records: &[TraceRecord]) {
+        self.watch.take(records);
     }
 
     /// Frames that were sent.

@@ -74,6 +74,25 @@ impl TraceOutput {
         }
     }
 
+    /// Ends it where what is read failed. A file that was written beside is dropped, and what is in its place stays; what was written in
+    /// place as it came is ended properly, because it may be nowhere else.
+    pub fn give_up(self) -> anyhow::Result<()> {
+        match self.sink {
+            Sink::Trace { writer, beside: None } => {
+                writer.finish().with_context(|| failed(&self.path))?;
+            }
+            Sink::Trace { beside: Some(_), .. } => {
+                eprintln!(
+                    "cantap: {} was not written; the trace could not be read to its end",
+                    shown(&self.path)
+                );
+            }
+            #[cfg(feature = "parquet")]
+            Sink::Columns(_) => {}
+        }
+        Ok(())
+    }
+
     /// Ends the file and puts it in its place. Says what it could not carry, and returns it.
     pub fn finish(self) -> anyhow::Result<LeftOut> {
         let left_out = match self.sink {

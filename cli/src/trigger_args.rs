@@ -3,19 +3,19 @@
 use std::time::Duration;
 
 use anyhow::Context;
-use cantap_signals::condition::Condition;
 use cantap_signals::trigger::{Trigger, Window};
 
 use crate::address::Address;
 use crate::args;
 use crate::completion;
 use crate::databases::DatabaseArgs;
+use crate::protocols;
 
 /// When to keep records; for commands to flatten into theirs.
 #[derive(clap::Args)]
 pub struct TriggerArgs {
-    /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123"
-    /// or "error" (see cantap search --help).
+    /// Keep only what happens around this condition, such as "Speed > 80 and Gear == Drive", "id == 0x123",
+    /// "error" or "uds.nrc" (see cantap search --help).
     #[arg(long, value_name = "CONDITION", add = completion::conditions())]
     pub trigger: Option<String>,
     /// Also keep what happened in this time before the condition held.
@@ -39,7 +39,7 @@ impl TriggerArgs {
     ) -> anyhow::Result<Option<Trigger>> {
         let Some(text) = &self.trigger else { return Ok(None) };
         let decoder = self.databases.or_of(devices).load(false, false)?;
-        let condition = Condition::new(text, &decoder).context("--trigger")?;
+        let condition = protocols::condition(text, &decoder).context("--trigger")?;
         let nanoseconds = |time: Duration| i64::try_from(time.as_nanos()).unwrap_or(i64::MAX);
         let window =
             Window { pre_ns: nanoseconds(self.pre), post_ns: nanoseconds(self.post), events: self.events };

@@ -117,6 +117,24 @@ fn every_time_is_written_as_the_others() {
     assert!(seen > 15, "{seen}");
 }
 
+/// `docs/interoperability.md` says what is shown, and by what: that has to be there.
+#[test]
+fn the_page_on_other_programs_names_tests_that_exist() {
+    let root = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
+    let page = std::fs::read_to_string(root.join("docs/interoperability.md")).unwrap();
+    let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| ")).collect();
+    let mut named = 0;
+    for row in rows {
+        let last = row.trim_end_matches(['|', ' ']).rsplit('|').next().unwrap_or_default();
+        let is_path = |word: &&str| word.contains('/') && !word.contains(' ') && !word.contains(':');
+        for path in last.split('`').skip(1).step_by(2).filter(is_path) {
+            assert!(root.join(path).is_file(), "{path}");
+            named += 1;
+        }
+    }
+    assert!(named > 15, "{named}");
+}
+
 /// What is asked for in every object of what was measured can be asked for everywhere.
 #[test]
 fn what_measures_or_tells_has_json() {
@@ -130,8 +148,11 @@ fn what_measures_or_tells_has_json() {
         }
     }
     without.sort();
+    // There on one system alone.
+    without.retain(|name| name != "bridge");
     // They write scripts or files, act, serve, or show a screen.
-    let expected = ["completions", "identify", "man", "monitor", "reset", "serve", "update", "virtual"]
-        .map(str::to_owned);
+    let expected =
+        ["completions", "extcap", "identify", "man", "monitor", "reset", "serve", "update", "virtual"]
+            .map(str::to_owned);
     assert_eq!(without, expected);
 }

@@ -121,10 +121,16 @@ fn bash_completes_behind_colons_and_equals_signs() {
 }
 
 #[test]
-fn fish_and_zsh_take_their_scripts() {
+fn fish_elvish_and_zsh_take_their_scripts() {
     let fish = "cantap completions fish | source; complete -C 'cantap decode --db car.dbc trace.log -s Sp'; \
                 complete -C 'cantap capture -d virtual:'";
     if let Some(found) = in_shell("fish", fish) {
+        assert_eq!(found, ["Speed", "virtual:car"]);
+    }
+    // Elvish has its line editor's names only where there is one: what is registered there gets another name here.
+    let elvish = "use str; eval (str:replace 'set edit:completion:arg-completer[cantap] =' 'var asked~ =' (cantap completions elvish | \
+                  slurp))\"\nasked cantap decode --db car.dbc trace.log -s Sp\nasked cantap capture -d virtual:\"";
+    if let Some(found) = in_shell("elvish", elvish) {
         assert_eq!(found, ["Speed", "virtual:car"]);
     }
     // Zsh completes in its line editor only: that the script is one, and registers, is what can be seen without a terminal.

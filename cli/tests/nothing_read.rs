@@ -64,19 +64,76 @@ fn an_older_output_stays_as_it_is_where_nothing_can_be_read() {
     // A trace without any frame is still a trace, and takes the older one's place.
     fs::write(directory.join("empty.log"), "").unwrap();
     let (code, _, err) = cantap(&directory, &["convert", "empty.log", "out.log"]);
-    assert_eq!((code, err.as_str()), (Some(0), ""));
+    assert_eq!((code, err.as_str()), (Some(0), "cantap: note: the file is empty (1)\n"));
     assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "");
     assert_eq!(fs::read_dir(&directory).unwrap().count(), 3, "nothing temporary is left");
 }
 
+/// As for every command that writes a file: a run that fails leaves the older one. What comes from a pipe is nowhere else, and is kept.
 #[test]
-fn what_was_read_until_a_strict_end_takes_the_outputs_place_whole() {
+fn a_strict_end_leaves_the_older_output_and_keeps_what_came_from_a_pipe() {
     let directory = directory("strict");
-    fs::write(directory.join("in.log"), "(1.000000) can0 123#11\nrubbish\n(2.000000) can0 123#11\n").unwrap();
-    fs::write(directory.join("out.log"), "older\n").unwrap();
-    let (code, _, _) = cantap(&directory, &["convert", "in.log", "out.log", "--strict"]);
-    assert_eq!(code, Some(1));
-    assert_eq!(fs::read_to_string(directory.join("out.log")).unwrap(), "(1.000000) can0 123#11\n");
+    let log = "(1.000000) can0 123#11\nrubbish\n(2.000000) can0 123#11\n";
+    fs::write(directory.join("in.log"), log).unwrap();
+    for output in ["out.log", "out.blf", "new.asc.gz", "new.parquet"] {
+        let is_older = output.starts_with("out");
+        if is_older {
+            fs::write(directory.join(output), "older\n").unwrap();
+        }
+        let (code, _, err) = cantap(&directory, &["convert", "in.log", output, "--strict"]);
+        assert_eq!(code, Some(1), "{output}: {err}");
+        let left = fs::read_to_string(directory.join(output)).ok();
+        assert_eq!(left.as_deref(), is_older.then_some("older\n"), "{output}");
+    }
+    let (code, _, err) = cantap(&directory, &["convert", "in.log", "out.log", "--strict"]);
+    assert!(code == Some(1) && err.contains("line 2") && err.contains("out.log was not written"), "{err}");
+    assert_eq!(fs::read_dir(&directory).unwrap().count(), 3, "nothing temporary is left");
+    let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+    command.args(["convert", "-", "piped.log", "--strict"]).current_dir(&directory);
+    let input = fs::File::open(directory.join("in.log")).unwrap();
+    assert_eq!(command.stdin(input).output().unwrap().status.code(), Some(1));
+    assert_eq!(fs::read_to_string(directory.join("piped.log")).unwrap(), "(1.000000) can0 123#11\n");
+}
+
+/// Of all formats only those without a head can be of no byte at all; what is empty is told.
+#[test]
+fn an_empty_file_is_an_empty_trace_only_where_the_format_has_no_head() {
+    let directory = directory("empty");
+    for name in ["a.log", "a.log.gz"] {
+        fs::write(directory.join(name), "").unwrap();
+        for command in ["stats", "convert"] {
+            let out = if command == "convert" { &["out.log"][..] } else { &[] };
+            let (code, _, err) = cantap(&directory, &[&[command, name], out].concat());
+            assert_eq!((code, err.as_str()), (Some(0), "cantap: note: the file is empty (1)\n"), "{name}");
+        }
+    }
+    for suffix in ["asc", "blf", "trc", "csv", "pcapng", "pcap", "mf4", "dif", "asc.zst", "db"] {
+        let name = format!("a.{suffix}");
+        fs::write(directory.join(&name), "").unwrap();
+        let (code, _, err) = cantap(&directory, &["stats", &name]);
+        assert_eq!(code, Some(1), "{name}: {err}");
+        assert!(err.contains(&format!("nothing in {name} could be read")), "{err}");
+        assert!(err.contains("it looks like an empty file"), "{err}");
+    }
+    // What we write of an empty trace has its head.
+    for suffix in ["log", "asc", "blf", "trc", "csv", "pcapng", "mf4", "dif", "asc.zst", "blf.gz"] {
+        let name = format!("written.{suffix}");
+        assert_eq!(cantap(&directory, &["convert", "a.log", &name]).0, Some(0), "{name}");
+        let (code, out, err) = cantap(&directory, &["stats", &name]);
+        assert_eq!(code, Some(0), "{name}: {err}");
+        assert!(out.contains("0 frames"), "{name}: {out}");
+    }
+}
+
+/// The live view shows what it can; as a command of a script it says that there was nothing.
+#[test]
+fn one_screen_of_a_file_that_could_not_be_read_is_no_success() {
+    let directory = directory("once");
+    fs::write(directory.join("diary.log"), "dear diary\n").unwrap();
+    let (code, out, err) = cantap(&directory, &["monitor", "--once", "diary.log"]);
+    assert_eq!(code, Some(1), "{err}");
+    assert!(out.contains("1 unreadable"), "{out}");
+    assert!(err.contains("nothing of the trace could be read: diary.log, line 1: expected"), "{err}");
 }
 
 #[test]

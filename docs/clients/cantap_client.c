@@ -17,7 +17,7 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { PROTOCOL = 4, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
+enum { PROTOCOL = 5, MAX_MESSAGE = 2048, MAX_ENCODED = MAX_MESSAGE + 4 + 9 + 1, HELLO = 0, OWN_TAG = 7 };
 
 static const char *const REPLIES[] = {"Hello", "Done", "Opened", "Status", "Time", "Filters", "Queued", "Registers", "Defaults",
                                       "Failures", "Edges"};
@@ -29,6 +29,7 @@ static const char *const STAGES[] = {"controller", "queue", "link", "host"};
 static const char *const ERRORS[] = {"stuff", "form", "acknowledgment", "bit-recessive", "bit-dominant", "crc"};
 static const char *const STATES[] = {"active", "warning", "passive", "bus-off"};
 static const char *const FAILURES[] = {"arbitration-lost", "bus-error", "aborted", "closed", "bus-off", "overtaken"};
+static const char *const ENDS[] = {"suspended", "board-lost", "server-ended", "configured"};
 
 /* The name of a number, or "?" for one that this protocol version does not have. */
 #define NAME(names, index) ((index) < sizeof(names) / sizeof *(names) ? (names)[index] : "?")
@@ -181,7 +182,7 @@ static uint64_t event_record(uint8_t index, Reader *m, uint64_t ticks) {
 }
 
 static void batch(Reader *m, bool last) {
-    if (last) number(m); /* the reason */
+    uint32_t reason = last ? (uint32_t)number(m) : 0;
     uint32_t told = (uint32_t)number(m), before[2], missing[2];
     uint64_t ticks = number(m);
     bool old = told - sequence > INT32_MAX;
@@ -195,7 +196,7 @@ static void batch(Reader *m, bool last) {
     if (missing[0] || missing[1]) printf("lost on the link %" PRIu32 " %" PRIu32 "\n", missing[0], missing[1]);
     for (int i = 0; i < 2; i++) lost[i] += missing[i], frames[i] = before[i];
     sequence = told + 1;
-    if (last) { ended = true; printf("%" PRIu64 " session ended\n", ticks); }
+    if (last) { ended = true; printf("%" PRIu64 " session ended: %s\n", ticks, NAME(ENDS, reason)); }
     while (!last && m->ok && m->at < m->end) {
         uint8_t head = byte(m), qualifiers = 0;
         if (head >= 0x41 && head <= 0x46) qualifiers = head & 7, head = byte(m);

@@ -6,7 +6,7 @@
 """
 import os, select, sys, time, tty, zlib
 
-PROTOCOL = 4
+PROTOCOL = 5
 REPLIES = "Hello Done Opened Status Time Filters Queued Registers Defaults Failures Edges".split()
 REFUSALS = ("Protocol Malformed NoSession Unsupported BadTiming BadId BadDlc BadTag BadEntry BadSlot ChannelOpen ChannelClosed "
             "ListenOnly QueueFull BanksExhausted WouldDisturb TooFarAhead Hardware NothingSaved NotBusOff "
@@ -15,6 +15,7 @@ NUMBERS = {"Protocol": 1, "QueueFull": 1, "BanksExhausted": 2, "NotGranted": 1} 
 STAGES = "controller queue link host".split()
 ERRORS = "stuff form acknowledgment bit-recessive bit-dominant crc".split()
 STATES = "active warning passive bus-off".split()
+ENDS = "suspended board-lost server-ended configured".split()
 FAILURES = "arbitration-lost bus-error aborted closed bus-off overtaken".split()
 
 
@@ -114,7 +115,7 @@ class Stream:
         if kind == 1:
             return self.response(m)
         if kind == 2:
-            m.number()  # the reason
+            reason = m.number()
         sequence, ticks, before = m.number(), m.number(), [m.number(), m.number()]
         ahead = sequence - self.sequence & 0xFFFFFFFF
         missing = [told - had & 0xFFFFFFFF for told, had in zip(before, self.frames)]
@@ -126,7 +127,7 @@ class Stream:
         self.sequence, self.frames = sequence + 1, before
         if kind == 2:
             self.ended = True
-            return self.say(f"{ticks} session ended")
+            return self.say(f"{ticks} session ended: {ENDS[reason]}")
         while m.more():
             ticks = self.record(m, ticks)
 

@@ -28,6 +28,8 @@ const GOOD_FRAMES: u32 = 4;
 const ANSWER_AFTER: Duration = Duration::from_secs(1);
 /// The controller listens for at least this long if it hears nothing.
 const LISTEN: Duration = Duration::from_millis(100);
+/// The same where two frames were read bit by bit: they prove the bit rate, so only errors could still contradict it.
+const LISTEN_PROVEN: Duration = Duration::from_millis(10);
 /// Errors without a frame between them that say that a measured rate was wrong, or that no frame ends well.
 const MOST_ERRORS: u32 = 12;
 /// How often it is measured again then.
@@ -141,6 +143,9 @@ struct Search<'a> {
     heard: u64,
     /// Changes of the level altogether.
     seen: u64,
+    /// The last of them, and the time of the very last, in ticks since the measurement began.
+    edges: Vec<PinEdge>,
+    at: f64,
 }
 
 /// Finds the bit rate of a channel's bus. `progress` is called again and again, and ends the search by returning false. The channel has to
@@ -152,7 +157,17 @@ pub fn search(
     progress: &mut dyn FnMut(Progress) -> bool,
 ) -> Result<Outcome, DeviceError> {
     let began = device.time()?;
-    let mut search = Search { device, channel, limits, progress, began, heard: began, seen: 0 };
+    let mut search = Search {
+        device,
+        channel,
+        limits,
+        progress,
+        began,
+        heard: began,
+        seen: 0,
+        edges: Vec::new(),
+        at: 0.0,
+    };
     let outcome = search.run();
     // Also where the search was given up in the middle.
     let ended = device.measure_edges(None);
@@ -173,7 +188,11 @@ impl Search<'_> {
         let mut rounds = 0;
         // That the clock does not reach a rate is said of two frames, and a contradiction measured again.
         let mut wanted = 1;
+        let mut goes_on = false;
         loop {
+            if !std::mem::take(&mut goes_on) {
+                self.begin()?;
+            }
             let measured = match self.measure(wanted)? {
                 Heard::Frames(measured) => measured,
                 Heard::Over(outcome) => return Ok(outcome),
@@ -184,7 +203,7 @@ impl Search<'_> {
             let bitrate_bps = match reach(self.device.hello().can_clock_hz, measured_bps, error) {
                 Reached::At { bitrate_bps } => bitrate_bps,
                 Reached::Not { .. } if measured.frames == 1 && wanted == 1 => {
-                    wanted = 2;
+                    (wanted, goes_on) = (2, true);
                     continue;
                 }
                 // What is no better known than this is not said to be beyond reach.
@@ -206,23 +225,30 @@ impl Search<'_> {
         (time.as_secs_f64() * f64::from(self.device.hello().tick_hz)) as u64
     }
 
-    /// Measures until this many frames were read, or nothing new comes.
+    /// Begins to measure, with nothing measured.
+    fn begin(&mut self) -> Result<(), DeviceError> {
+        self.device.measure_edges(Some(self.channel))?;
+        self.edges.clear();
+        self.at = 0.0;
+        Ok(())
+    }
+
+    /// Measures until this many frames were read, or nothing new comes. What was read since the measurement began counts.
     fn measure(&mut self, wanted: u32) -> Result<Heard, DeviceError> {
         let tick_hz = f64::from(self.device.hello().tick_hz);
         // A little beyond what a device opens, so that a rate out there is named and not taken for another.
         let [least, most] = [MAX_BITRATE_BPS, MIN_BITRATE_BPS].map(|bps| tick_hz / f64::from(bps));
-        self.device.measure_edges(Some(self.channel))?;
-        let mut edges: Vec<PinEdge> = Vec::new();
-        let (mut at, mut unread, mut looked) = (0.0, 0, self.began);
-        let guess_at = self.device.time()? + self.ticks(GUESS_AFTER);
+        let (mut unread, mut looked) = (0, self.began);
+        let begun = self.device.time()?;
+        let guess_at = begun + self.ticks(GUESS_AFTER);
         // When the first frame was read, and what all of them tell.
-        let mut found: Option<(u64, Measured)> = None;
+        let mut found = measure(&self.edges, least, most).map(|measured| (begun, measured));
         loop {
             let told = self.device.edges()?;
             let (new, now) = (told.edges.len(), told.ticks);
             for edge in &told.edges {
-                at += f64::from(edge.ticks);
-                edges.push(PinEdge { at, dominant: edge.dominant, unsure: edge.unsure });
+                self.at += f64::from(edge.ticks);
+                self.edges.push(PinEdge { at: self.at, dominant: edge.dominant, unsure: edge.unsure });
             }
             if new > 0 {
                 self.heard = now;
@@ -235,14 +261,14 @@ impl Search<'_> {
             let is_due =
                 new == 0 || unread >= MANY_EDGES || now.saturating_sub(looked) > self.ticks(LOOK_EVERY);
             if unread > 0 && is_due {
-                edges.drain(..edges.len().saturating_sub(MOST_EDGES));
+                self.edges.drain(..self.edges.len().saturating_sub(MOST_EDGES));
                 (unread, looked) = (0, now);
-                if let Some(measured) = measure(&edges, least, most) {
+                if let Some(measured) = measure(&self.edges, least, most) {
                     found = Some((found.map_or(now, |(since, _)| since), measured));
                 } else if found.is_none()
                     && self.seen >= GUESS_EDGES
                     && now > guess_at
-                    && let Some(guess) = estimate(&edges, least, most)
+                    && let Some(guess) = estimate(&self.edges, least, most)
                 {
                     return Ok(Heard::Frames(guess));
                 }
@@ -307,7 +333,9 @@ impl Search<'_> {
     ) -> Result<Outcome, DeviceError> {
         // The device's time, not ours: an emulated one may be slower.
         let opened = self.device.time()?;
-        let answer_at = (self.began + self.ticks(ANSWER_AFTER)).max(opened + self.ticks(LISTEN));
+        let is_proven = measured.frames > 1 && measured.acknowledged > 0;
+        let listen = if is_proven { LISTEN_PROVEN } else { LISTEN };
+        let answer_at = (self.began + self.ticks(ANSWER_AFTER)).max(opened + self.ticks(listen));
         loop {
             std::thread::sleep(ASK_EVERY);
             let status = self.device.status()?;
@@ -315,7 +343,7 @@ impl Search<'_> {
             let frames = now.frames.wrapping_sub(frames_before);
             let errors = now.bus_errors.wrapping_sub(errors_before);
             // A frame that the controller took, or two that were read bit by bit and nothing that speaks against them.
-            let is_enough = frames > 0 || measured.frames > 1 && measured.acknowledged > 0 && errors == 0;
+            let is_enough = frames > 0 || is_proven && errors == 0;
             if frames >= GOOD_FRAMES || is_enough && status.ticks >= answer_at {
                 let frames = frames + measured.frames;
                 return Ok(Outcome::Found { bitrate_bps, measured_bps, timing, frames });

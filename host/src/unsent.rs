@@ -2,7 +2,7 @@
 //!
 //! A device reports how each transmission ended, but not why one does not end at all: a controller tries for ever. Then the
 //! errors since its last frame, its state and what others send tell what is in the way. The records of the device are taken
-//! for it, so it is for programs that do not use them otherwise.
+//! for it, unless the program uses them itself and hands them in.
 
 use std::time::{Duration, Instant};
 
@@ -208,7 +208,8 @@ impl Seen {
 /// Watches frames being sent.
 pub struct Watch<'d> {
     device: &'d Device,
-    records: Records,
+    /// None where whoever uses the records hands them in.
+    records: Option<Records>,
     channels: [Seen; CHANNELS],
     recovers: bool,
     look_at: Instant,
@@ -220,10 +221,24 @@ impl<'d> Watch<'d> {
     pub fn new(device: &'d Device, recovers: bool) -> Self {
         Self {
             device,
-            records: device.records(),
+            records: Some(device.records()),
             channels: Default::default(),
             recovers,
             look_at: Instant::now(),
+        }
+    }
+
+    /// The same for a program that uses the records itself, and hands each of them to [`Self::take`].
+    pub fn fed(device: &'d Device, recovers: bool) -> Self {
+        Self { device, records: None, channels: Default::default(), recovers, look_at: Instant::now() }
+    }
+
+    /// Takes notice of what was on the bus.
+    pub fn take(&mut self, records: &[TraceRecord]) {
+        for record in records {
+            if let Some(channel) = Channel::from_number(record.channel) {
+                self.channels[channel.index()].push(record);
+            }
         }
     }
 
@@ -288,17 +303,15 @@ impl<'d> Watch<'d> {
     }
 
     fn take_records(&mut self) -> Result<(), DeviceError> {
-        while let Some(batch) = self.records.next_batch(Duration::ZERO)? {
+        let Some(mut records) = self.records.take() else { return Ok(()) };
+        while let Some(batch) = records.next_batch(Duration::ZERO)? {
             if batch.is_empty() {
                 break;
             }
-            for record in &batch {
-                if let Some(channel) = Channel::from_number(record.channel) {
-                    self.channels[channel.index()].push(record);
-                }
-            }
-            self.records.recycle(batch);
+            self.take(&batch);
+            records.recycle(batch);
         }
+        self.records = Some(records);
         Ok(())
     }
 }

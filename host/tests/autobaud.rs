@@ -78,6 +78,14 @@ fn a_rate_that_the_clock_does_not_reach_is_named_and_is_no_success() {
     }
 }
 
+/// It is said of two frames. The first one was forgotten when the second was waited for, so that it took three.
+#[test]
+fn a_rate_beyond_reach_is_named_after_two_frames() {
+    let (outcome, seconds) = search_on("bitrate=615384,burst=1/700ms");
+    assert!(matches!(outcome, Outcome::Unreachable { .. }), "{outcome:?}");
+    assert!(seconds < 1.2, "{seconds} s");
+}
+
 #[test]
 fn a_silent_bus_is_given_up_in_time() {
     let (outcome, seconds) = search_within(Duration::from_millis(400), "load=0");

@@ -15,7 +15,8 @@ fi
 
 programs="busybox-static can-utils usbip kmod usbutils iproute2 util-linux perl-base"
 modem_manager="modemmanager udev dbus-daemon dbus-bin"
-modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw slcan cdc-acm vhci-hcd xhci-pci"
+python="python3-can python3-wrapt python3-typing-extensions python3-packaging python3-msgpack python3-pkg-resources python3-minimal"
+modules="virtio_pci virtio_net 9p 9pnet_virtio can can-raw vcan vxcan slcan cdc-acm vhci-hcd xhci-pci"
 
 # `apt-get` tells where each file comes from, which is of use only if it fails.
 quietly() { "$@" > log 2>&1 || { cat log >&2; return 1; }; }
@@ -33,15 +34,17 @@ fetch() {
 # Only root may; others take what the last one fetched.
 [ "$(id -u)" != 0 ] || fetch update
 image=$(apt-cache show --no-all-versions linux-image-amd64 | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
+# The interpreter has its version in its name.
+python="$python $(apt-cache depends python3-minimal | sed -n 's/^ *PreDepends: \(python3[^ ]*\)$/\1/p')"
 # The libraries that the programs need, and theirs; not those of what they only suggest, in effect, by alternatives.
 # shellcheck disable=SC2086 # lists of words
 libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces --no-enhances \
-  $programs $modem_manager | grep -E '^(lib[a-z0-9+.-]+|zlib1g)$' | grep -vE 'perl|pam|elogind|installer|cryptsetup|systemd-shared' | sort -u)
+  $programs $modem_manager $python | grep -E '^(lib[a-z0-9+.-]+|zlib1g)$' | grep -vE 'perl|pam|elogind|installer|cryptsetup|systemd-shared' | sort -u)
 rm -rf packages root kernel
 mkdir packages root kernel
 # shellcheck disable=SC2086
 cd packages
-fetch download "$image" $programs $modem_manager $libraries
+fetch download "$image" $programs $modem_manager $python $libraries
 cd ..
 
 for package in packages/*.deb; do

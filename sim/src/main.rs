@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap_emu::Image;
+use cantap_emu::probe::Task;
 use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, parse_log};
 use cantap_emu::usb_host::Timing;
@@ -272,7 +273,7 @@ fn print(out: &mut impl Write, report: &Report) -> io::Result<()> {
         "core: {:.1} % awake, {:.1} cycles per frame in the receive interrupts ({} timing)",
         report.cpu_load_pct, report.isr_cycles_per_frame, report.bound
     )?;
-    for (name, entries, share) in &report.tasks {
+    for Task { name, entries, percent: share, .. } in &report.tasks {
         writeln!(out, "  {name}: {entries} times, {share:.2} %")?;
     }
     if let Some(profile) = &report.profile {

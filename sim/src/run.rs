@@ -14,6 +14,7 @@ use cantap_emu::bus::Source;
 use cantap_emu::bus::bits::bus_bits;
 use cantap_emu::elf::Image;
 use cantap_emu::machine::{Machine, Setup};
+use cantap_emu::probe::Task;
 use cantap_emu::profile::Table;
 use cantap_emu::soc::OddAccess;
 use cantap_emu::timing::Bound;
@@ -139,8 +140,8 @@ pub struct Report {
     pub isr_cycles_per_frame: f64,
     /// Seconds that the emulation took per emulated second of traffic.
     pub host_s_per_emulated_s: f64,
-    /// Share of the traffic's time for each exception that ran: name, entries, per cent.
-    pub tasks: Vec<(String, u64, f64)>,
+    /// What each exception that ran cost of the traffic's time.
+    pub tasks: Vec<Task>,
     /// Where the cycles went, as a table, if it was asked for.
     pub profile: Option<String>,
     /// What broke the law of counting.
@@ -274,7 +275,7 @@ struct Costs {
     masked_ns: f64,
     load_pct: f64,
     capture_cycles: u64,
-    tasks: Vec<(String, u64, f64)>,
+    tasks: Vec<Task>,
 }
 
 impl Costs {

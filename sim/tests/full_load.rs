@@ -5,10 +5,11 @@ mod common;
 
 use std::time::Duration;
 
+use cantap_emu::machine::Setup;
 use cantap_emu::timing::Bound;
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::Timing;
-use cantap_sim::board::CLOCK;
+use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig, timing};
 use cantap_sim::run::{Load, Options, Report, run};
 use cantap_wire::Channel;
@@ -28,7 +29,7 @@ fn at_full_load(kind: Kind, seconds: f64) -> Options {
 }
 
 /// Both channels at full load lose nothing, and stamps are at most 0.6 us late; with a core that waits as long as it can, 1.
-fn nothing_is_lost(options: &Options, least_frames_per_s: f64) {
+fn nothing_is_lost(options: &Options, least_frames_per_s: f64) -> Report {
     let report = capture(options);
     assert_eq!(report.channels.len(), 2);
     for channel in &report.channels {
@@ -38,12 +39,38 @@ fn nothing_is_lost(options: &Options, least_frames_per_s: f64) {
     }
     let latest_ns = if report.bound == Bound::Best { 600 } else { 1000 };
     assert!(report.stamps.max <= latest_ns, "{:?}", report.stamps);
+    report
 }
 
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn two_seconds_of_the_shortest_data_frames_on_both_channels_lose_nothing() {
-    nothing_is_lost(&at_full_load(Kind::Std0, 2.0), 20_800.0);
+    let report = nothing_is_lost(&at_full_load(Kind::Std0, 2.0), 20_800.0);
+    assert!(report.bound == Bound::Worst || report.cpu_load_pct <= 25.0, "{} %", report.cpu_load_pct);
+}
+
+/// Beside the capture of a full channel, with everything as slow as the manuals allow.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_queue_that_has_filled_drains_at_a_megabyte_a_second() {
+    let setup = Setup { bound: Bound::Worst, ..board::setup() };
+    let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
+    rig.connect().unwrap();
+    rig.listen(Channel::Can1, 1_000_000).unwrap();
+    let from = rig.now();
+    rig.add_traffic(Channel::Can1, 1_000_000, Traffic::new(Kind::Std0, 1, 100.0, from, from + 700 * MS));
+    rig.with_host(|host, _| host.read(false));
+    rig.run_for(600 * MS).unwrap();
+    rig.with_host(|host, _| host.read(true));
+    let bytes = |rig: &mut Rig| rig.with_host(|host, _| host.counters().in_bytes);
+    let before = bytes(&mut rig);
+    rig.run_for(50 * MS).unwrap();
+    let drained = bytes(&mut rig) - before;
+    eprintln!("{drained} bytes in 50 ms");
+    assert!(drained >= 50_000, "{drained} bytes in 50 ms");
+    rig.close(Channel::Can1).unwrap();
+    assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
+    assert_eq!(rig.ledger.losses(Channel::Can1).total(), 0);
 }
 
 /// The same with everything as slow as the manuals allow.

@@ -5,6 +5,9 @@ mod common;
 
 use Channel::{Can1, Can2};
 use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::machine::Setup;
+use cantap_emu::probe::Task;
+use cantap_emu::timing::Bound::{self, Best, Worst};
 use cantap_emu::traffic::{Kind, Traffic};
 use cantap_emu::usb_host::Timing;
 use cantap_sim::board::{self, CLOCK};
@@ -22,8 +25,15 @@ const STORM: u64 = 100 * MS;
 /// A request is answered within this, whatever else goes on. A host gives up after ten times as long.
 const ANSWERED_WITHIN: u64 = 30 * MS;
 
-fn connected() -> Rig {
-    let mut rig = Rig::new(common::firmware(), board::setup(), Timing::hasty(CLOCK));
+/// What drains, sends and records.
+const PRIORITY_4: [&str; 7] =
+    ["CAN1_RX1", "DMA1_STREAM0", "USART2", "USART3", "TIM2", "CAN1_SCE", "CAN2_SCE"];
+/// The longest call of those: a FIFO bears 141 µs, less the other channel's drain.
+const LONGEST_CALL_US: f64 = 120.0;
+
+fn connected(bound: Bound) -> Rig {
+    let setup = Setup { bound, ..board::setup() };
+    let mut rig = Rig::new(common::firmware(), setup, Timing::hasty(CLOCK));
     rig.connect().unwrap();
     rig
 }
@@ -94,10 +104,12 @@ fn weather(rig: &mut Rig, what: &str) {
             channel.transmit_failures
         );
     }
-    for (name, entries, percent) in rig.machine.tasks(rig.now() - from) {
+    for Task { name, entries, percent, longest_us } in rig.machine.tasks(rig.now() - from) {
         if percent > 2.0 {
-            eprintln!("    {name}: {entries}, {percent:.1} %");
+            eprintln!("    {name}: {entries}, {percent:.1} %, at most {longest_us:.1} us");
         }
+        let bounded = PRIORITY_4.contains(&name.as_str());
+        assert!(!bounded || longest_us <= LONGEST_CALL_US, "{what}: {name} took {longest_us:.1} us");
     }
     eprintln!("    load {:.1} %", rig.machine.probe().load_percent(rig.now()));
 }
@@ -106,8 +118,8 @@ fn weather(rig: &mut Rig, what: &str) {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn a_full_table_costs_the_other_channel_no_frame() {
-    for acknowledged in [false, true] {
-        let mut rig = connected();
+    for (bound, acknowledged) in [(Best, false), (Best, true), (Worst, true)] {
+        let mut rig = connected(bound);
         open_normal(&mut rig, Can1, acknowledged);
         rig.listen(Can2, MEGABIT).unwrap();
         fill_tables(&mut rig, Can1);
@@ -130,8 +142,8 @@ fn a_full_table_costs_the_other_channel_no_frame() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn full_tables_on_both_channels_leave_usb_alive() {
-    for acknowledged in [false, true] {
-        let mut rig = connected();
+    for (bound, acknowledged) in [(Best, false), (Best, true), (Worst, false), (Worst, true)] {
+        let mut rig = connected(bound);
         for channel in Channel::ALL {
             open_normal(&mut rig, channel, acknowledged);
         }
@@ -185,7 +197,7 @@ fn full_tables_on_both_channels_leave_usb_alive() {
 #[test]
 #[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
 fn an_aborted_queue_costs_the_other_channel_no_frame() {
-    let mut rig = connected();
+    let mut rig = connected(Worst);
     open_normal(&mut rig, Can1, false);
     rig.listen(Can2, MEGABIT).unwrap();
     let from = rig.now();
@@ -202,4 +214,41 @@ fn an_aborted_queue_costs_the_other_channel_no_frame() {
     rig.close(Can2).unwrap();
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
     assert_eq!(rig.ledger.losses(Can2).total(), 0);
+}
+
+/// Frames with times so close that each is waited for rather than left to the alarm: the longest that one call can last.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn frames_that_are_due_one_after_the_other_hold_up_no_drain_for_long() {
+    for spacing_us in [5, 7, 9, 10, 11, 13] {
+        let mut rig = connected(Worst);
+        for channel in Channel::ALL {
+            open_normal(&mut rig, channel, true);
+        }
+        let first = rig.status().unwrap().ticks + u64::from(8_000 * TICKS_PER_US);
+        for channel in Channel::ALL {
+            for burst in 0..4 {
+                // As many as there are mailboxes, in turn with the other channel's.
+                let at = |n: u64| {
+                    let nth = 2 * n + channel.index() as u64;
+                    first + (burst * 2_000 + nth * spacing_us) * u64::from(TICKS_PER_US)
+                };
+                let frames = (0..3)
+                    .map(|n| TxFrame { tag: n, frame: frame("155#"), at_ticks: Some(at(n.into())) })
+                    .collect();
+                rig.ask(Command::Send { channel, frames }).unwrap();
+            }
+        }
+        rig.machine.reset_probe();
+        let from = rig.now();
+        rig.run_for(20 * MS).unwrap();
+        let status = rig.status().unwrap();
+        assert_eq!(status.channels.map(|channel| channel.transmitted), [12; 2], "{spacing_us} us");
+        for Task { name, longest_us, .. } in rig.machine.tasks(rig.now() - from) {
+            if PRIORITY_4.contains(&name.as_str()) {
+                eprintln!("{spacing_us} us: {name} at most {longest_us:.1} us");
+                assert!(longest_us <= LONGEST_CALL_US, "{spacing_us} us: {name} took {longest_us:.1} us");
+            }
+        }
+    }
 }

@@ -9,6 +9,7 @@ use cantap_emu::usb_host::Timing;
 use cantap_emu::usb_host::control::{DEVICE_REMOTE_WAKEUP, Outcome, Request, SET_FEATURE};
 use cantap_sim::board::{self, CLOCK};
 use cantap_sim::rig::{MS, Rig};
+use cantap_wire::message::EndReason;
 use cantap_wire::{Channel, Command};
 
 const MEGABIT: u32 = 1_000_000;
@@ -88,6 +89,48 @@ fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
         listen(&mut rig);
     }
     nothing_was_lost(rig);
+}
+
+/// A configuration under an open port, of which the program that has it is told nothing: when that asks for something, it learns when its
+/// session ended and why. What the configuration took out of the endpoint is counted, and nothing else is missing.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
+    for (round, without) in [(0, false), (1, true), (2, false), (3, true)] {
+        let mut rig = capturing();
+        rig.with_host(|host, _| host.keep_port(true));
+        rig.run_for(2 * MS + round * MS / 3).unwrap();
+        let configured_at = rig.now();
+        if without {
+            assert_eq!(ask(&mut rig, Request::set_configuration(0)), Outcome::Done(Vec::new()));
+            rig.run_for(3 * MS).unwrap();
+        }
+        assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()));
+        rig.run_for(10 * MS).unwrap();
+        for channel in Channel::ALL {
+            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+        }
+        assert_eq!(rig.session_end(), None, "round {round}: told to whoever listens");
+        rig.ask(Command::Status).unwrap_err();
+        let Some((ticks, EndReason::Configured)) = rig.session_end() else {
+            panic!("round {round}: refused before the end was told: {:?}", rig.session_end());
+        };
+        let ended_at = rig.clock_origin() + ticks * 12;
+        assert!((configured_at..configured_at + 3 * MS).contains(&ended_at), "round {round}");
+        rig.follow_session_end();
+        for channel in Channel::ALL {
+            let losses = rig.ledger.losses(channel);
+            assert!(losses.total() == losses.link && losses.link < 100, "round {round}: {losses:?}");
+            assert!(rig.ledger.delivered_count(channel) > 5, "round {round}");
+        }
+        assert!(rig.ledger.holds(), "round {round}: {:?}", rig.ledger.faults());
+        assert_eq!(rig.with_host(|host, _| host.counters().enumerations), 1);
+        // Whoever greets the device on the same port goes on.
+        rig.greet().unwrap();
+        listen(&mut rig);
+        rig.with_host(|host, _| host.keep_port(false));
+        assert_eq!(rig.with_host(|_, otg| otg.misuse()), Misuse::default());
+    }
 }
 
 #[test]

@@ -150,9 +150,14 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// While this waits, what ends is not to wait for its own task: the transmission after it would find no interrupt that stamps it.
-    fn collect_stamped<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
+    /// While this waits, until `at`, what ends is not to wait for its own task: the transmission after it would find no interrupt that
+    /// stamps it.
+    fn collect_until<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, at: u32) {
         for channel in Channel::ALL {
+            // For one channel that takes 3 µs at worst.
+            if at.wrapping_sub(clock.now()) as i32 <= (C::ALARM_EARLY_TICKS / 4) as i32 {
+                return;
+            }
             if let Some(stamp) = traffic[channel.index()].stamped() {
                 self.collect(channel, &mut traffic[channel.index()], clock, stamp);
             }
@@ -177,13 +182,18 @@ impl<'q, const N: usize> Capture<'q, N> {
 
     /// For this long a call goes on to wait for what is due: twice the time by which alarms are early, so that the frame that it came
     /// for, and one that is due soon after it on the other channel, leave in time. For what is due later the alarm is set
-    /// again, which takes less than half that time: the tasks that drain the FIFOs come before it.
+    /// again: the tasks that drain the FIFOs come before it.
     const fn patience_ticks<C: Clock>() -> u64 {
         2 * C::ALARM_EARLY_TICKS as u64
     }
 
+    /// To set the alarm, leave, and come back with the next frame prepared takes up to 9 µs. What is due earlier is waited for.
+    const fn return_ticks<C: Clock>() -> u32 {
+        C::ALARM_EARLY_TICKS / 4 * 3
+    }
+
     /// Sends what of the queues is due, and waits for what is due so soon that the alarm would come too late for it: until `patience`
-    /// ends, and after that only from one frame to the next while they are half an early alarm apart; the mailboxes take six. All
+    /// ends, and after that only from one frame to the next while they are too close for the alarm; the mailboxes take six. All
     /// but the request itself is done ahead, so that two frames due at one moment leave at one moment.
     #[inline]
     fn load_in_time<T: Traffic, C: Clock>(&mut self, traffic: &mut [T; CHANNELS], clock: &C, patience: u64) {
@@ -219,7 +229,7 @@ impl<'q, const N: usize> Capture<'q, N> {
             let ahead = |at: u64| u32::try_from(at.saturating_sub(now)).unwrap_or(u32::MAX);
             let [first, second] = heads.map(ahead);
             let next = first.min(second);
-            if next > early.min(ahead(patience)).max(early / 2) {
+            if next > early.min(ahead(patience)).max(Self::return_ticks::<C>()) {
                 return;
             }
             // What is due soon after it would find no time for this between the two. A periodic frame is not waited past; one that
@@ -242,10 +252,7 @@ impl<'q, const N: usize> Capture<'q, N> {
                 let Some(mailbox) = mailboxes[channel] else { continue };
                 if heads[channel] > now {
                     let at = heads[channel] as u32;
-                    // For both channels that takes 4 µs at worst.
-                    if at.wrapping_sub(clock.now()) as i32 > (early / 3) as i32 {
-                        self.collect_stamped(traffic, clock);
-                    }
+                    self.collect_until(traffic, clock, at);
                     clock.wait_until(at);
                 }
                 traffic[channel].request(mailbox);
@@ -297,7 +304,10 @@ impl<'q, const N: usize> Capture<'q, N> {
     /// Once a millisecond: keeps time going, reads what no interrupt reports, retries what found no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
-            self.on_channel_tick(channel, &mut traffic[channel.index()], clock);
+            if self.on_tick_errors(channel, &mut traffic[channel.index()], clock) {
+                self.on_tick_queues(channel, &mut traffic[channel.index()], clock);
+                self.arm(clock);
+            }
         }
     }
 
@@ -307,21 +317,33 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.recorder.aside(&mark.event, at);
     }
 
-    /// One channel's part of [`Self::on_tick`], for where the alarm must be able to come between the two.
-    pub fn on_channel_tick(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+    /// Part of [`Self::on_tick`], apart for where the alarm must be able to come between the parts: a channel's errors. Returns whether
+    /// the channel is open; if not, the rest has nothing to do.
+    pub fn on_tick_errors(
+        &mut self,
+        channel: Channel,
+        traffic: &mut impl Traffic,
+        clock: &impl Clock,
+    ) -> bool {
         let now = self.recorder.time(clock.now());
         let state = &mut self.channels[channel.index()];
         if state.open.is_none() {
-            return;
+            return false;
         }
         state.errors.update(traffic, &mut self.recorder, now);
         state.errors.tick(&mut self.recorder, now);
         Self::give_up_when_off(state, traffic, &mut self.recorder, now);
+        true
+    }
+
+    /// Part of [`Self::on_tick`]: what a channel sends, and what was lost. [`Self::arm`] belongs behind it.
+    pub fn on_tick_queues(&mut self, channel: Channel, traffic: &mut impl Traffic, clock: &impl Clock) {
+        let now = self.recorder.time(clock.now());
+        let state = &mut self.channels[channel.index()];
         // Mailboxes that finish meanwhile are left to the interrupt, which knows when.
         state.transmitter.service(traffic, &mut self.recorder, now);
         state.transmitter.tick(&mut self.recorder, now);
         self.recorder.tick(now);
-        self.arm(clock);
     }
 
     /// A controller that stays bus-off sends nothing more: its queue is given up, frame by frame, and periodic frames wait.

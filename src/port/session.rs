@@ -17,7 +17,7 @@ use crate::port::inbox::Inbox;
 use crate::port::outbox::Outbox;
 use crate::port::sender::Sender;
 use crate::port::slcan::{Answer, Slcan};
-use crate::ports::{ON_ITS_WAY, PACKET, Port};
+use crate::ports::{ON_ITS_WAY, PACKET, Port, PortHistory};
 
 /// Longest request on the wire, zero byte included.
 const MAX_REQUEST_ENCODED: usize = max_encoded_len(MAX_REQUEST);
@@ -44,15 +44,17 @@ enum Origin {
     Device,
 }
 
-/// How far the device is with a session that ends because the host sleeps.
+/// How far the device is with a session that it ends by itself.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Slept {
+enum Ending {
     /// There is none, or its host knows.
     No,
+    /// As soon as what is under way lets it.
+    Wanted(EndReason),
     /// The channels leave their buses.
-    Leaving,
+    Leaving(EndReason),
     /// They had left at this time, which the host is to hear behind what is queued.
-    Since(u64),
+    Since(EndReason, u64),
 }
 
 /// The memory of a session: a dozen kilobytes, which are made where they stay and never pass over a stack.
@@ -96,8 +98,11 @@ pub struct Session<'q, const N: usize = QUEUE_BYTES> {
     outbox: &'q mut Outbox,
     language: Language,
     work: Option<(Work, Origin)>,
-    /// The host put the bus to sleep with the port open.
-    slept: Slept,
+    ending: Ending,
+    /// The host of a session that has ended is there still, as far as the device can tell: what is left of the session is for it.
+    is_heir: bool,
+    /// What the host had done with the port when it was last looked at.
+    history: PortHistory,
     answers: &'q mut Answers,
     marks: SofMarks,
     request: &'q mut [u8; MAX_REQUEST_ENCODED],
@@ -117,7 +122,9 @@ impl<'q, const N: usize> Session<'q, N> {
             outbox,
             language: Language::Unknown,
             work: None,
-            slept: Slept::No,
+            ending: Ending::No,
+            is_heir: false,
+            history: PortHistory { opened: 0, configured: 0 },
             answers,
             marks: SofMarks::new(),
             request,
@@ -144,8 +151,13 @@ impl<'q, const N: usize> Session<'q, N> {
     /// Reads, works and writes as far as it goes without waiting. To be called at every USB interrupt and
     /// every millisecond.
     pub fn poll(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
+        self.notice(port.history(), board);
         if port.is_suspended() {
-            return self.fall_silent(board);
+            self.want_end(EndReason::Suspended);
+        }
+        self.begin_end(board);
+        if port.is_suspended() {
+            return self.look_after_work(board);
         }
         if !port.is_open() {
             return self.hang_up(port, board);
@@ -153,7 +165,9 @@ impl<'q, const N: usize> Session<'q, N> {
         self.read(port);
         loop {
             self.look_after_work(board);
-            self.outbox.pump(port);
+            if !self.is_holding_back() {
+                self.outbox.pump(port);
+            }
             let moved = self.outbox.is_empty() && self.fill_outbox(board);
             let handled = self.handle_next(board);
             if !moved && !handled {
@@ -161,39 +175,75 @@ impl<'q, const N: usize> Session<'q, N> {
             }
         }
         self.hold(port);
-        self.outbox.end(port);
+        if !self.is_holding_back() {
+            self.outbox.end(port);
+        }
     }
 
-    /// The host sleeps with the port open: the channels leave their buses, and the session ends. What is queued stays, and so does
-    /// what the controller has taken of it: the host gets it when it wakes, and behind it the end.
-    fn fall_silent(&mut self, board: &mut impl Board<'q, N>) {
+    /// Whether what is left of a session waits for whoever asks: its host may be gone, and the next is not to get any of it.
+    fn is_holding_back(&self) -> bool {
+        self.ending != Ending::No && !self.is_heir
+    }
+
+    /// Looks at what the host has done with the port since the last time. Configured anew, it may or may not have told the program
+    /// that has the port open, so what is left of the session waits until one asks. One that opens the port is another.
+    fn notice(&mut self, now: PortHistory, board: &mut impl Board<'q, N>) {
+        let seen = core::mem::replace(&mut self.history, now);
+        if seen.opened != now.opened {
+            self.forget_host(board);
+        } else if seen.configured != now.configured {
+            self.want_end(EndReason::Configured);
+            self.is_heir = false;
+        }
+    }
+
+    /// The session is to end, if there is one or one is just beginning.
+    fn want_end(&mut self, reason: EndReason) {
+        if self.ending == Ending::No && self.is_active() {
+            self.ending = Ending::Wanted(reason);
+            self.is_heir = reason != EndReason::Configured;
+        }
+    }
+
+    /// Ends the session if that is wanted: the channels leave their buses. What is queued stays, and after a suspension what the
+    /// controller has taken of it: the host gets it, and behind it the end.
+    fn begin_end(&mut self, board: &mut impl Board<'q, N>) {
+        let Ending::Wanted(reason) = self.ending else { return };
+        // A session that is just beginning begins first, and a restart that was asked for comes.
+        if matches!(self.work, Some((Work::Silence | Work::Restart | Work::Bootloader, _))) {
+            return;
+        }
         let in_session = match self.language {
             Language::Unknown => false,
             Language::Native { greeted } => greeted,
             Language::Slcan => true,
         };
-        // A session that is just beginning begins first, and a restart that was asked for comes.
-        let busy = matches!(self.work, Some((Work::Silence | Work::Restart | Work::Bootloader, _)));
-        if in_session && self.slept == Slept::No && !busy {
-            self.slept = Slept::Leaving;
-            if let Some((_, Origin::Request(id))) = self.work {
-                self.answers.add(id, &Err(Refusal::NoSession));
-            }
-            if let Language::Native { greeted } = &mut self.language {
-                *greeted = false;
-            }
-            self.begin(Work::Retreat, Origin::Device, board);
+        if !in_session {
+            self.ending = Ending::No;
+            return;
         }
-        self.look_after_work(board);
+        self.ending = Ending::Leaving(reason);
+        if let Some((_, Origin::Request(id))) = self.work {
+            self.answers.add(id, &Err(Refusal::NoSession));
+        }
+        if let Language::Native { greeted } = &mut self.language {
+            *greeted = false;
+        }
+        self.begin(Work::Retreat, Origin::Device, board);
     }
 
     /// The host is gone: the channels leave the bus, and nothing of it remains.
     fn hang_up(&mut self, port: &mut impl Port, board: &mut impl Board<'q, N>) {
         port.hold(false);
         while port.read(self.packet).is_some() {}
+        self.forget_host(board);
+        self.look_after_work(board);
+    }
+
+    fn forget_host(&mut self, board: &mut impl Board<'q, N>) {
         if self.is_active() {
             self.language = Language::Unknown;
-            self.slept = Slept::No;
+            self.ending = Ending::No;
             self.inbox.clear();
             self.outbox.clear();
             self.answers.clear();
@@ -202,7 +252,6 @@ impl<'q, const N: usize> Session<'q, N> {
                 self.begin(Work::Silence, Origin::Device, board);
             }
         }
-        self.look_after_work(board);
     }
 
     /// Takes every packet that is there: one left in the USB peripheral would hold up the control pipe behind it. So the host is
@@ -231,15 +280,18 @@ impl<'q, const N: usize> Session<'q, N> {
         let Some(result) = self.commands.progress(work, board) else { return };
         self.work = None;
         if matches!(work, Work::Silence) {
-            self.slept = Slept::No;
+            if !matches!(self.ending, Ending::Wanted(_)) {
+                self.ending = Ending::No;
+            }
             self.queue.clear();
             let now = board.with_capture(|capture, _, clock| capture.restart(clock));
             self.sender.restart(now);
             self.slcan.restart(now);
             self.marks = SofMarks::new();
         }
-        if matches!(work, Work::Retreat) {
-            self.slept = Slept::Since(board.with_capture(|capture, _, clock| capture.now(clock)));
+        if let (Work::Retreat, Ending::Leaving(reason)) = (work, self.ending) {
+            let at = board.with_capture(|capture, _, clock| capture.now(clock));
+            self.ending = Ending::Since(reason, at);
         }
         match origin {
             Origin::Request(id) => {
@@ -333,7 +385,10 @@ impl<'q, const N: usize> Session<'q, N> {
             Ok(Request { id, command }) if greeted || matches!(command, Command::Hello { .. }) => {
                 (id, self.commands.execute(command, board))
             }
-            Ok(Request { id, .. }) => (id, Err(Refusal::NoSession)),
+            Ok(Request { id, .. }) => {
+                self.is_heir = true;
+                (id, Err(Refusal::NoSession))
+            }
             Err(_) => {
                 self.commands.bad_requests = self.commands.bad_requests.wrapping_add(1);
                 let Ok((id, _)) = postcard::take_from_bytes(message) else { return };
@@ -375,6 +430,11 @@ impl<'q, const N: usize> Session<'q, N> {
         else {
             return false;
         };
+        if matches!(self.ending, Ending::Since(..)) && !self.is_heir {
+            // What is said behind the rest of the session is the answer.
+            self.is_heir = true;
+            return true;
+        }
         if taken.is_none_or(|copied| copied.is_err()) {
             self.slcan.answer(Answer::Refused);
             return true;
@@ -387,26 +447,32 @@ impl<'q, const N: usize> Session<'q, N> {
 
     /// Fills the empty outbox with what goes next: the answers, and behind them what was captured. Returns whether there was
     /// something.
+    ///
+    /// Answers wait for the end of a session that has ended: a host takes the first refusal for it, and listens no more.
     fn fill_outbox(&mut self, board: &mut impl Board<'q, N>) -> bool {
-        let Self { queue, sender, slcan, outbox, answers, slept, .. } = self;
+        if self.is_holding_back() {
+            return false;
+        }
+        let Self { queue, sender, slcan, outbox, answers, ending, .. } = self;
+        let untold = matches!(ending, Ending::Leaving(_) | Ending::Since(..));
         match self.language {
             Language::Unknown => {}
             Language::Native { .. } => outbox.fill(|out| {
-                let answered = answers.take(out);
+                let answered = if untold { 0 } else { answers.take(out) };
                 let rest = &mut out[answered..];
                 let mut len = sender.next_batch(queue, board.now(), rest, |message| board.crc32(message));
-                if let (0, Slept::Since(at)) = (len, *slept) {
-                    len = sender.end(queue, EndReason::Suspended, at, rest);
+                if let (0, Ending::Since(reason, at)) = (len, *ending) {
+                    len = sender.end(queue, reason, at, rest);
                     if len > 0 {
-                        *slept = Slept::No;
+                        *ending = Ending::No;
                     }
                 }
                 answered + len
             }),
             Language::Slcan => {
                 outbox.fill(|out| slcan.next_lines(queue, out));
-                if outbox.is_empty() && matches!(slept, Slept::Since(_)) {
-                    *slept = Slept::No;
+                if outbox.is_empty() && matches!(ending, Ending::Since(..)) {
+                    *ending = Ending::No;
                     slcan.answer(Answer::Refused);
                     outbox.fill(|out| slcan.next_lines(queue, out));
                 }

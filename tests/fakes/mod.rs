@@ -13,7 +13,8 @@ use cantap_firmware::port::board::Board;
 use cantap_firmware::port::command::Identity;
 use cantap_firmware::port::session::Session;
 use cantap_firmware::ports::{
-    Chip, Clock, Control, EdgeMeter, ErrorStatus, FilterBanks, Outcome, PACKET, PinEdge, Port, Traffic,
+    Chip, Clock, Control, EdgeMeter, ErrorStatus, FilterBanks, Outcome, PACKET, PinEdge, Port, PortHistory,
+    Traffic,
 };
 use cantap_wire::framing::{self, CRC_LEN, MAX_ENCODED, MAX_MESSAGE};
 use cantap_wire::message::{ChannelConfig, EndReason, Failures, Mode, RegisterSet};
@@ -245,6 +246,7 @@ impl Chip for FakeChip {
 pub struct FakePort {
     pub open: bool,
     pub suspended: bool,
+    pub history: PortHistory,
     pub to_device: VecDeque<Vec<u8>>,
     pub from_device: Vec<u8>,
     pub packets: Vec<usize>,
@@ -261,6 +263,10 @@ impl Port for FakePort {
 
     fn is_suspended(&self) -> bool {
         self.suspended
+    }
+
+    fn history(&self) -> PortHistory {
+        self.history
     }
 
     fn write(&mut self, bytes: &[u8]) -> Option<usize> {

@@ -80,6 +80,9 @@ pub enum EndReason {
     BoardLost,
     /// Never from a device: the server of a shared board has ended.
     ServerEnded,
+    /// The host configured the device anew (USB 2.0, 9.4.7) without having closed the port. Sent only when a host that does not know
+    /// asks for something: whoever opens the port meanwhile is another.
+    Configured,
 }
 
 /// The one answer that every request gets.

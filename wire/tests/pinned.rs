@@ -28,7 +28,7 @@ fn written(result: &Result<Reply, Refusal>) -> String {
 
 #[test]
 fn the_version_is_the_one_that_these_bytes_belong_to() {
-    assert_eq!(PROTOCOL_VERSION, 4);
+    assert_eq!(PROTOCOL_VERSION, 5);
 }
 
 #[test]
@@ -104,7 +104,9 @@ fn batch_headers_and_the_end_of_a_session() {
     assert_eq!(bytes(&DeviceMessage::Batch(header)), "00 ac 02 80 80 80 80 10 80 01 01");
     let end = SessionEnd { reason: EndReason::Suspended, header };
     assert_eq!(bytes(&DeviceMessage::Ended(end)), "02 00 ac 02 80 80 80 80 10 80 01 01");
-    for (reason, expected) in [(EndReason::BoardLost, "01"), (EndReason::ServerEnded, "02")] {
+    for (reason, expected) in
+        [(EndReason::BoardLost, "01"), (EndReason::ServerEnded, "02"), (EndReason::Configured, "03")]
+    {
         let bytes = bytes(&DeviceMessage::Ended(SessionEnd { reason, header }));
         assert_eq!(bytes, format!("02 {expected} ac 02 80 80 80 80 10 80 01 01"));
     }

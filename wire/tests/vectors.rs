@@ -249,10 +249,9 @@ fn batches() -> Vec<Value> {
         reads.insert(0, json!("lost on the link 0 2"));
     }
     let mut out = [0; MAX_ENCODED];
-    let len = session.writer.end(EndReason::Suspended, session.ticks, &mut out);
-    session.lines.push(json!({
-        "what": "the session's end", "wire": hex(&out[..len]), "reads": [format!("{} session ended", session.ticks)],
-    }));
+    let len = session.writer.end(EndReason::Configured, session.ticks, &mut out);
+    let reads = format!("{} session ended: configured", session.ticks);
+    session.lines.push(json!({ "what": "the session's end", "wire": hex(&out[..len]), "reads": [reads] }));
     session.lines
 }
 
@@ -378,7 +377,9 @@ fn the_session_in_the_file_is_whole() {
                 Decoded::BatchesLost { batches: 2, frames } => {
                     format!("lost on the link {} {}", frames[0], frames[1])
                 }
-                Decoded::Ended { ticks, .. } => format!("{ticks} session ended"),
+                Decoded::Ended { ticks, reason: EndReason::Configured } => {
+                    format!("{ticks} session ended: configured")
+                }
                 other => panic!("{other:?}"),
             });
         });

@@ -15,6 +15,7 @@ mod dependencies;
 mod dist;
 mod features;
 mod firmware;
+mod fleet;
 mod kernel;
 #[cfg(feature = "check")]
 mod links;

@@ -10,6 +10,9 @@ use crate::workspace;
 
 /// Programs from Debian's packages: a program, and the package that has it.
 const PROGRAMS: [(&str, &str); 2] = [("log2asc", "can-utils"), ("tshark", "tshark")];
+/// Also where no peer may be skipped: its package starts a server that other computers reach, which is nobody's wish but a test
+/// machine's.
+const SSH_SERVER: (&str, &str) = ("/usr/sbin/sshd", "openssh-server");
 /// Python packages, with their versions.
 pub const REQUIREMENTS: &str = "xtask/peers.txt";
 
@@ -23,8 +26,10 @@ impl Peers {
     /// Finds the peers, and installs what is missing where that is possible. `None`, with a word on
     /// what to run, where it is not: the tests that need them then say that they were skipped.
     pub fn find_or_install(shell: &Shell) -> Result<Option<Self>> {
+        let must_not_skip = std::env::var_os("CANTAP_REQUIRE_PEERS").is_some_and(|value| value == "1");
         let missing: Vec<&str> = PROGRAMS
             .iter()
+            .chain(must_not_skip.then_some(&SSH_SERVER))
             .filter(|(program, _)| !is_installed(program))
             .map(|(_, package)| *package)
             .collect();
@@ -42,11 +47,16 @@ impl Peers {
     }
 }
 
-/// A Python environment with the packages of `peers.txt`, made anew where that file has changed.
+/// A Python environment with the packages of `peers.txt`.
 pub fn venv(shell: &Shell) -> Result<PathBuf> {
-    let venv = workspace::target().join("peers");
+    environment(shell, "peers", REQUIREMENTS)
+}
+
+/// A Python environment under this name in `target/`, with the packages that a file names, made anew where that has changed.
+pub fn environment(shell: &Shell, name: &str, requirements: &str) -> Result<PathBuf> {
+    let venv = workspace::target().join(name);
     let installed = venv.join("installed.txt");
-    let wanted = shell.read_file(REQUIREMENTS)?;
+    let wanted = shell.read_file(requirements)?;
     if shell.read_file(&installed).is_ok_and(|text| text == wanted) {
         return Ok(venv);
     }
@@ -58,7 +68,7 @@ pub fn venv(shell: &Shell) -> Result<PathBuf> {
     }
     cmd!(shell, "python3 -m venv --clear {venv}").run()?;
     let python = venv.join("bin/python");
-    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {REQUIREMENTS}").run()?;
+    cmd!(shell, "{python} -m pip install --quiet --retries 10 -r {requirements}").run()?;
     shell.write_file(installed, wanted)?;
     Ok(venv)
 }

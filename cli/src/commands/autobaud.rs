@@ -77,7 +77,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Why there is no bit rate, and what to do.
-fn failure(outcome: Outcome, channel: Channel, seconds: f64) -> String {
+pub fn failure(outcome: Outcome, channel: Channel, seconds: f64) -> String {
     let channel = channel.number();
     match outcome {
         Outcome::NoTraffic => format!(

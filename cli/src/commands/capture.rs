@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use anyhow::bail;
 use cantap::{TraceEvent, TraceRecord};
-use cantap_formats::{Format, ReadOptions, open_reader};
+use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
 use cantap_signals::trigger::Trigger;
 use cantap_trace::filter::Filter;
 
@@ -113,7 +113,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let trigger = args.trigger.trigger(boards.addresses())?;
     let mut live = LiveRecords::open(&boards, &args.open, &args.filter, args.time)?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
-    let mut sink = create_sink(args, trigger)?;
+    let mut sink = create_sink(args, trigger, live.channels())?;
     let started = Instant::now();
     let mut channels: Vec<_> = boards.channel_numbers().map(|number| (number, Meter::new(0))).collect();
     for (number, config, can_clock_hz) in live.opened() {
@@ -142,7 +142,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Where the records go.
-fn create_sink(args: &Args, trigger: Option<Trigger>) -> anyhow::Result<Sink> {
+fn create_sink(args: &Args, trigger: Option<Trigger>, channels: Vec<ChannelInfo>) -> anyhow::Result<Sink> {
     let mut sink = Sink::new(trigger);
     let path = match &args.output {
         Some(path) => path.as_path(),
@@ -150,7 +150,8 @@ fn create_sink(args: &Args, trigger: Option<Trigger>) -> anyhow::Result<Sink> {
         None if args.json => return Ok(sink),
         None => Path::new("-"),
     };
-    sink.create(path, &args.write.options(implied_format(path))?)?;
+    let options = args.write.options(implied_format(path))?;
+    sink.create(path, &WriteOptions { channels, ..options })?;
     Ok(sink)
 }
 

@@ -1,26 +1,22 @@
 //! `cantap conversations`: what the frames mean.
 
 mod json;
-mod sheet;
 mod summary;
-mod surveyed;
 
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
-use cantap_protocols::iso_tp::Pair;
-use cantap_protocols::{Conversations, Event, Options, Protocol};
+use cantap_protocols::{Event, Options, Protocol};
 use cantap_trace::Interface;
 
-use self::sheet::SheetPath;
 use self::summary::Summary;
-use self::surveyed::Surveyed;
 use super::decode::Seconds;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
+use crate::protocols::{ProtocolArgs, Reading};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -47,13 +43,8 @@ pub struct Args {
     /// alone shows transfers as they are.
     #[arg(long = "protocol", value_name = "PROTOCOL", value_delimiter = ',')]
     protocols: Vec<Protocol>,
-    /// Two identifiers that talk to each other by ISO 15765-2, as 7E0:7E8; with an address in the first data byte as
-    /// 6F1/12:612/F1. Can be repeated. Others are found by what they do.
-    #[arg(long = "pair", value_name = "ID:ID")]
-    pairs: Vec<Pair>,
-    /// The sheet (EDS or DCF) of CANopen nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
-    #[arg(long = "eds", value_name = "[NODE:]FILE")]
-    sheets: Vec<SheetPath>,
+    #[command(flatten)]
+    help: ProtocolArgs,
     /// Only what went wrong: refusals, requests without a response, transfers that broke.
     #[arg(long)]
     faults: bool,
@@ -74,42 +65,19 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         .then(|| databases.load(args.read.strict, args.quiet))
         .transpose()?
         .map(Arc::new);
-    let sheets = args.sheets.iter().map(|path| path.load(args.quiet)).collect::<anyhow::Result<Vec<_>>>()?;
+    let options = Options { protocols: args.protocols.clone(), ..args.help.options(args.quiet)? };
+    let mut reading = Reading::new(options, decoder, args.quiet);
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut out = BufWriter::with_capacity(1 << 16, std::io::stdout().lock());
-    let mut surveyed = Surveyed::new(args.protocols.is_empty());
-    let mut conversations = None;
     let mut summary = Summary::default();
-    let (mut batch, mut events) = (Vec::new(), Vec::new());
+    let mut batch = Vec::new();
     loop {
         let more = records.next_batch(&mut batch)?;
-        // Until it is clear what is spoken, records wait.
-        if conversations.is_none() && surveyed.take(&mut batch, more) {
-            let found = surveyed.found();
-            if !args.quiet {
-                surveyed::tell(found.as_deref());
-            }
-            let (protocols, pairs) = (args.protocols.clone(), args.pairs.clone());
-            let options =
-                Options { protocols, pairs, spoken: found, decoder: decoder.clone(), sheets: sheets.clone() };
-            conversations = Some(Conversations::new(&options));
-            batch = surveyed.release();
-        }
-        if let Some(conversations) = &mut conversations {
-            for record in &batch {
-                summary.record(record);
-                conversations.take(record, &mut events);
-            }
-            if !more {
-                conversations.finish(&mut events);
-            }
-        }
-        for event in events.drain(..) {
+        batch.iter().for_each(|record| summary.record(record));
+        reading.take(&batch, more, |event| {
             summary.event(&event);
-            if !args.faults || summary::is_fault(&event) {
-                write(&mut out, &event, args.json)?;
-            }
-        }
+            if !args.faults || event.is_fault() { write(&mut out, &event, args.json) } else { Ok(()) }
+        })?;
         if !more {
             break;
         }
@@ -129,7 +97,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     Ok(ExitCode::SUCCESS)
 }
 
-fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
+/// Writes an event as a line.
+pub fn write(out: &mut impl Write, event: &Event, json: bool) -> std::io::Result<()> {
     if json {
         return json::write(out, event);
     }

@@ -36,8 +36,8 @@ use crate::trace_output::{TraceOutput, named};
     Read and written: candump, asc, blf, trc (2.1; trc2.0 to trc1.0), csv (python-can's), csv-full, csv-analyser, \
     csv-gvret (SavvyCAN's), pcapng, mf4, dif. Only read: pcap, candump-screen, busmaster, crtd, kvaser, canking, microchip, \
     canhacker, printer and sqlite (python-can's).\n\n\
-    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read (an older \
-    OUT then stays as it is), or with --strict something in IN was wrong.")]
+    What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read, or \
+    with --strict something in IN was wrong. An older OUT then stays as it is; what had come from a pipe is kept.")]
 pub struct Args {
     /// The trace to read; - for standard input.
     #[arg(value_name = "IN")]
@@ -85,7 +85,7 @@ pub struct Args {
 #[derive(clap::Args)]
 pub struct WriteArgs {
     /// The format to write, where the file's name does not tell: candump, asc, blf, trc (2.1), trc2.0, trc1.3, trc1.2,
-    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, pcapng, mf4, dif.
+    /// trc1.1, trc1.0, csv (python-can's), csv-full, csv-analyser, csv-gvret, pcapng, mf4, dif.
     #[arg(long, visible_alias = "to", value_name = "FORMAT", add = completion::written_formats())]
     format: Option<Format>,
     /// Begin a new file (trace-000001.log and so on) at this size (100M) or time (1h). Repeat for both.
@@ -131,7 +131,8 @@ impl WriteArgs {
         let line_end = if self.line_end == "lf" { LineEnd::Lf } else { LineEnd::CrLf };
         let dif = if self.dif == "rows" { DifConvention::Rows } else { DifConvention::Columns };
         let table = TableStyle { separator: self.separator, decimal_mark: self.decimal_mark, line_end, dif };
-        Ok(WriteOptions { format: self.format.or(implied), rotation, table, zone: self.zone.clone() })
+        let format = self.format.or(implied);
+        Ok(WriteOptions { format, rotation, table, zone: self.zone.clone(), ..WriteOptions::default() })
     }
 }
 
@@ -181,7 +182,6 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut window = TimeRange::new(args.start, args.end);
     let mut written = 0_u64;
     let mut batch = Vec::new();
-    // What came until an error is kept: the file is still finished.
     let read = loop {
         match records.next_batch(&mut batch) {
             Ok(true) => {}
@@ -204,14 +204,13 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             output.flush()?;
         }
     };
-    let output = match (output, &read) {
-        (Some(output), _) => output,
-        // An empty trace is still a trace.
-        (None, Ok(())) => create()?,
-        (None, Err(_)) => return read.map(|()| ExitCode::SUCCESS),
-    };
+    if let Err(error) = read {
+        output.map_or(Ok(()), TraceOutput::give_up)?;
+        return Err(error);
+    }
+    // An empty trace is still a trace.
+    let output = output.map_or_else(create, Ok)?;
     let mut left_out = output.finish()?;
-    read?;
     if args.json {
         let missing = records.missing();
         left_out.merge(&missing.left_out);

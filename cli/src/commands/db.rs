@@ -96,9 +96,14 @@ fn list(args: &Args, databases: &[Database], out: &mut impl Write) -> anyhow::Re
             0 => String::new(),
             count => format!(", {} (--warnings lists them)", counted(count, "warning")),
         };
+        let buses = match &database.buses[..] {
+            [] => String::new(),
+            [bus] => format!(", bus {bus}"),
+            buses => format!(", buses {} (FILE#BUS is one)", buses.join(", ")),
+        };
         writeln!(
             out,
-            "{}: {}, {}{warnings}",
+            "{}: {}, {}{buses}{warnings}",
             database.file,
             counted(database.messages.len(), "message"),
             counted(signals, "signal")

@@ -7,6 +7,7 @@ mod csv;
 mod decoded;
 mod json;
 mod output;
+mod said;
 mod text;
 mod wide;
 
@@ -16,12 +17,15 @@ pub use text::write_values;
 
 use std::process::ExitCode;
 
-use cantap::TraceEvent;
-use cantap_signals::Decoder;
+use std::sync::Arc;
+
+use cantap::{TraceEvent, TraceRecord};
+use cantap_signals::{Decoder, SignalValue};
 
 use self::decoded::Decoded;
 use self::output::{Form, Output};
 use crate::input::Records;
+use crate::protocols::{Read, Reading};
 use crate::wrong::wrong;
 
 /// What the summary says.
@@ -31,14 +35,22 @@ struct Count {
     decoded: u64,
     values: u64,
     lost: u64,
+    /// What was said, with `--protocols`.
+    #[serde(skip_serializing_if = "is_zero")]
+    events: u64,
+}
+
+#[expect(clippy::trivially_copy_pass_by_ref, reason = "serde hands out references")]
+const fn is_zero(count: &u64) -> bool {
+    *count == 0
 }
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
-    if databases.is_empty() {
+    if databases.is_empty() && !args.protocols {
         return Err(wrong(
-            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml)",
+            "no database to decode by; give one with --db FILE (.dbc, .kcd, .sym, .arxml or .toml), or --protocols",
         ));
     }
     let decoder = databases.load_some(args.read.strict, args.quiet, &args.signals)?;
@@ -49,8 +61,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut summary = serde_json::to_value(&count)?;
     records.missing().put_into(&mut summary);
     output.finish(&summary)?;
-    let Count { frames, decoded, values, lost } = count;
-    eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values");
+    let Count { frames, decoded, values, lost, events } = count;
+    let said = if args.protocols { format!(", {events} events of protocols") } else { String::new() };
+    eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values{said}");
     if lost > 0 {
         eprintln!("cantap: {lost} frames or more are missing in the trace");
     }
@@ -66,29 +79,56 @@ fn decode(
     let mut count = Count::default();
     let mut values = Vec::new();
     let mut batch = Vec::new();
-    while records.next_batch(&mut batch)? {
-        for record in &batch {
-            if let TraceEvent::Lost { count: lost, .. } = record.event {
-                count.lost += u64::from(lost);
+    let mut reading = if args.protocols {
+        let decoder = (!args.databases.is_empty()).then(|| Arc::new(decoder.clone()));
+        Some(Reading::new(args.protocol.options(args.quiet)?, decoder, args.quiet))
+    } else {
+        None
+    };
+    loop {
+        let more = records.next_batch(&mut batch)?;
+        match &mut reading {
+            None => {
+                for record in &batch {
+                    one(args, decoder, record, &mut values, &mut count, output)?;
+                }
             }
-            let Some(frame) = record.frame() else {
-                output.push_event(record)?;
-                continue;
-            };
-            count.frames += 1;
-            let Some(reference) = decoder.decode(record.channel, frame, &mut values) else { continue };
-            // Chosen signals only: a message without any of them is not worth a line.
-            if values.is_empty() && !args.signals.is_empty() {
-                continue;
-            }
-            count.decoded += 1;
-            count.values += values.len() as u64;
-            let message = decoder.message(reference);
-            output.push(&Decoded { record, frame, reference, message, values: &values })?;
+            Some(reading) => reading.take_both(&batch, more, |read| match read {
+                Read::Record(record) => one(args, decoder, record, &mut values, &mut count, output),
+                Read::Event(event) => {
+                    count.events += 1;
+                    output.push_said(&event)
+                }
+            })?,
+        }
+        if !more {
+            return Ok(count);
         }
         if records.may_wait() {
             output.flush()?;
         }
     }
-    Ok(count)
+}
+
+fn one(
+    args: &Args,
+    decoder: &Decoder,
+    record: &TraceRecord,
+    values: &mut Vec<SignalValue>,
+    count: &mut Count,
+    output: &mut Output,
+) -> anyhow::Result<()> {
+    if let TraceEvent::Lost { count: lost, .. } = record.event {
+        count.lost += u64::from(lost);
+    }
+    let Some(frame) = record.frame() else { return output.push_event(record) };
+    count.frames += 1;
+    let Some(reference) = decoder.decode(record.channel, frame, values) else { return Ok(()) };
+    // Chosen signals only: a message without any of them is not worth a line.
+    if values.is_empty() && !args.signals.is_empty() {
+        return Ok(());
+    }
+    count.decoded += 1;
+    count.values += values.len() as u64;
+    output.push(&Decoded { record, frame, reference, message: decoder.message(reference), values })
 }

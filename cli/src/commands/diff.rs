@@ -1,5 +1,7 @@
 //! `cantap diff`: what two traces say differently.
 
+mod protocols;
+
 use std::io::{BufWriter, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
@@ -7,15 +9,18 @@ use std::process::ExitCode;
 use cantap_trace::diff::{Changed, Difference, Key, Profile, compare};
 use serde_json::{Value, json};
 
+use self::protocols::Protocols;
 use crate::exit;
 use crate::input::ReadArgs;
 use crate::missing::Missing;
+use crate::protocols::{Known, ProtocolArgs};
 
 /// The command line.
 #[derive(clap::Args)]
 #[command(after_help = "Examples:\n  \
     cantap diff before.log after.log\n  \
-    cantap diff good.blf bad.asc --tolerance 25 --json\n\n\
+    cantap diff good.blf bad.asc --tolerance 25 --json\n  \
+    cantap diff monday.log friday.log --protocols --eds drive.eds\n\n\
     Bits are shown from the highest: 0 and 1 never changed in that trace, x did.\n\
     Exit code: 0, also if the traces differ; with --check 3 if they do.")]
 pub struct Args {
@@ -29,6 +34,11 @@ pub struct Args {
     /// Compare identifiers whatever channel they are on.
     #[arg(long)]
     ignore_channels: bool,
+    /// Compare nodes and objects too, by the protocols that each trace shows.
+    #[arg(long)]
+    protocols: bool,
+    #[command(flatten)]
+    protocol: ProtocolArgs,
     /// End with 3 if the traces differ.
     #[arg(long)]
     check: bool,
@@ -48,8 +58,12 @@ fn percent(text: &str) -> Result<f64, String> {
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
-    let ((a, mut missing_a), (b, missing_b)) = (profile(args, &args.a)?, profile(args, &args.b)?);
+    let (a, mut missing_a, known_a) = profile(args, &args.a)?;
+    let (b, missing_b, known_b) = profile(args, &args.b)?;
     let difference = compare(&a, &b, args.tolerance / 100.0);
+    let known = known_a.as_ref().zip(known_b.as_ref());
+    let protocols = known.map(|(a, b)| Protocols::new([a.overview(), b.overview()], args.ignore_channels));
+    let is_none = difference.is_none() && protocols.as_ref().is_none_or(Protocols::is_none);
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
         let mut object = to_json(&difference);
@@ -57,25 +71,37 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         missing_a.merge(&missing_b);
         missing_a.put_into(&mut object);
         object["missing_pct"] = shares;
+        object["equal"] = is_none.into();
+        if let Some(protocols) = &protocols {
+            object["protocols"] = protocols.object();
+        }
         writeln!(out, "{object}")?;
     } else {
         print(args, &difference, &mut out)?;
+        if let Some(protocols) = &protocols {
+            protocols.print([&args.a, &args.b].map(|path| path.display().to_string()), &mut out)?;
+        }
     }
     out.flush()?;
-    let failed = args.check && !difference.is_none();
+    let failed = args.check && !is_none;
     Ok(if failed { ExitCode::from(exit::CHECK_FAILED) } else { ExitCode::SUCCESS })
 }
 
-fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing)> {
+fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing, Option<Known>)> {
     let mut profile = if args.ignore_channels { Profile::ignoring_channels() } else { Profile::default() };
     let mut records = args.read.open(path)?;
+    let mut known = args.protocols.then(|| args.protocol.known(false)).transpose()?;
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
-        for record in &batch {
-            profile.add(record);
+        batch.iter().for_each(|record| profile.add(record));
+        if let Some(known) = &mut known {
+            known.take(&batch, true);
         }
     }
-    Ok((profile, records.missing()))
+    if let Some(known) = &mut known {
+        known.take(&[], false);
+    }
+    Ok((profile, records.missing(), known))
 }
 
 fn name(args: &Args, key: Key) -> String {
@@ -158,6 +184,5 @@ fn to_json(difference: &Difference) -> Value {
         "only_b": only(&difference.only_b),
         "changed": changed.collect::<Vec<_>>(),
         "same": difference.same,
-        "equal": difference.is_none(),
     })
 }

@@ -3,6 +3,9 @@
 pub mod align;
 pub mod autobaud;
 pub mod bits;
+#[cfg(target_os = "linux")]
+pub mod bridge;
+pub mod canopen;
 pub mod capture;
 pub mod care;
 pub mod completions;
@@ -13,11 +16,14 @@ pub mod decode;
 pub mod defaults;
 pub mod demo;
 pub mod diff;
+pub mod extcap;
 pub mod r#gen;
 pub mod info;
+pub mod j1939;
 pub mod list;
 pub mod man;
 pub mod monitor;
+pub mod obd;
 pub mod plot;
 pub mod replay;
 pub mod search;
@@ -27,6 +33,7 @@ pub mod serve;
 pub mod stats;
 pub mod status;
 pub mod timing;
+pub mod uds;
 pub mod update;
 #[cfg(unix)]
 pub mod virtual_device;
@@ -58,6 +65,14 @@ pub enum Command {
     Capture(capture::Args),
     /// Show what the frames mean: requests and responses, transfers, by protocol.
     Conversations(conversations::Args),
+    /// Ask a vehicle by OBD-II: what it supports, live values, trouble codes, its VIN.
+    Obd(Box<obd::Args>),
+    /// Ask an ECU by UDS: identifiers, sessions, routines, trouble codes, any request.
+    Uds(Box<uds::Args>),
+    /// Talk with CANopen nodes: find them, read and write objects, start and stop them, give them numbers.
+    Canopen(Box<canopen::Args>),
+    /// Talk with J1939 nodes: claim an address, ask for parameter groups and trouble codes, send messages.
+    J1939(Box<j1939::Args>),
     /// Print the completion script of a shell.
     Completions(completions::Args),
     /// Write the manual pages.
@@ -76,8 +91,13 @@ pub enum Command {
     /// Run a virtual device behind a pseudo terminal.
     #[cfg(unix)]
     Virtual(virtual_device::Args),
+    /// Carry a device's channels to and from CAN interfaces of Linux: SocketCAN.
+    #[cfg(target_os = "linux")]
+    Bridge(bridge::Args),
     /// Share a device: many programs at once, on this machine or on others.
     Serve(serve::Args),
+    /// Be interfaces of Wireshark: `cantap extcap install`.
+    Extcap(Box<extcap::Args>),
     /// Show a device's state: counters, errors, queue, temperature, registers.
     Status(status::Args),
     /// Test a board: everything that it can show by itself, and a report to send in.
@@ -115,6 +135,10 @@ impl Command {
             Self::Timing(args) => timing::run(&args),
             Self::Capture(args) => capture::run(&args),
             Self::Conversations(args) => conversations::run(&args),
+            Self::Obd(args) => obd::run(&args),
+            Self::Uds(args) => uds::run(&args),
+            Self::Canopen(args) => canopen::run(&args),
+            Self::J1939(args) => j1939::run(&args),
             Self::Completions(args) => completions::run(&args),
             Self::Man(args) => man::run(&args, line),
             Self::Db(args) => db::run(&args),
@@ -127,6 +151,9 @@ impl Command {
             Self::Status(args) => status::run(&args),
             Self::Selftest(args) => selftest::run(&args),
             Self::Autobaud(args) => autobaud::run(&args),
+            #[cfg(target_os = "linux")]
+            Self::Bridge(args) => bridge::run(&args),
+            Self::Extcap(args) => extcap::run(*args),
             Self::Serve(args) => serve::run(&args),
             Self::Send(args) => send::run(&args),
             Self::Gen(args) => r#gen::run(&args),

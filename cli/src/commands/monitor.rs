@@ -24,7 +24,7 @@ use crate::monitor::plan::Plan;
 use crate::monitor::profile::Profile;
 use crate::monitor::source::Origin;
 use crate::monitor::theme::Theme;
-use crate::monitor::{once, orders, picture, run as show, text};
+use crate::monitor::{Once, once, orders, picture, run as show, text};
 use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
@@ -61,7 +61,7 @@ pub struct Args {
     /// A profile: device, bit rates, databases, filters, view, send list.
     #[arg(short, long, value_name = "FILE")]
     profile: Option<PathBuf>,
-    /// The page to begin with: trace, fixed, signals, graph, statistics, send or record.
+    /// The page to begin with: trace, fixed, signals, graph, statistics, send, record or nodes.
     #[arg(long, value_name = "PAGE", value_parser = view)]
     view: Option<View>,
     /// Record to this file from the start.
@@ -92,7 +92,8 @@ pub struct Args {
 
 fn view(text: &str) -> Result<View, String> {
     let found = View::ALL.into_iter().find(|view| view.title().eq_ignore_ascii_case(text));
-    found.ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send or record".to_owned())
+    found
+        .ok_or_else(|| "a page is trace, fixed, signals, graph, statistics, send, record or nodes".to_owned())
 }
 
 fn size(text: &str) -> Result<(u16, u16), String> {
@@ -148,11 +149,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         for remark in remarks {
             eprintln!("cantap: {remark}");
         }
-        let screen = once(origin, app, model, receiver, args.size, args.time)?;
+        let Once { screen, nothing_read } = once(origin, app, model, receiver, args.size, args.time)?;
         match &args.svg {
             None => std::io::stdout().lock().write_all(text(&screen).as_bytes())?,
             Some(path) => beside::write(path, picture::svg(&screen).as_bytes())
                 .with_context(|| format!("cannot write {}", path.display()))?,
+        }
+        if let Some(first) = nothing_read {
+            bail!("nothing of the trace could be read: {first}");
         }
     } else {
         model.notice = [faults, remarks].concat().join("; ");

@@ -20,6 +20,7 @@ use crate::exit;
 use crate::input::{ReadArgs, Records};
 use crate::live::LiveArgs;
 use crate::missing::Missing;
+use crate::protocols::{self, ProtocolArgs};
 use crate::trace_output::TraceOutput;
 use crate::words::{error_name, failure_name, state_name};
 use crate::wrong::wrong;
@@ -31,10 +32,12 @@ use crate::wrong::wrong;
     cantap search trace.log --db car.dbc 'Speed > 80 and Gear == Drive' -C 5\n  \
     cantap search trace.blf --data '* DE AD' -o found.asc\n  \
     cantap search trace.log 'id == 0x123 and byte[0] & 0x80 != 0' --count\n  \
-    cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n\n\
+    cantap search -d /dev/ttyACM0 -b 500k -e 'error or id == 0x7DF' -m 1\n  \
+    cantap search workshop.log 'uds.sid == 0x22 and uds.nrc'\n\n\
     A condition knows: signals (Speed, Engine.Speed; the last value received), texts of value tables, id,\n\
     dlc, len, ch (from 1), ext, rtr, byte[N], error, lost, numbers (12, 0x1F), + - * / % & |, == != < <= > >=,\n\
-    not, and, or, parentheses.\n\n\
+    not, and, or, parentheses; and what frames say together: uds.nrc, j1939.spn == 110, canopen.node == 5 and\n\
+    canopen.fault (docs/protocols.md). Of such, the frame is shown that completes it, and behind it what it says.\n\n\
     Exit codes: 0 something was found, 1 nothing was found or a failure, 2 wrong command line.")]
 pub struct Args {
     /// The trace; - for standard input.
@@ -56,6 +59,8 @@ pub struct Args {
     live: LiveArgs,
     #[command(flatten)]
     databases: DatabaseArgs,
+    #[command(flatten)]
+    protocol: ProtocolArgs,
     /// Show this many records after each one found.
     #[arg(short = 'A', long, value_name = "N")]
     after_context: Option<usize>,
@@ -95,7 +100,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let databases = args.databases.or_of(args.live.devices());
     let decoder = databases.load(args.read.strict, args.quiet)?;
     let text = args.condition.as_ref().or(args.positional.as_ref());
-    let condition = text.map(|text| Condition::new(text, &decoder)).transpose();
+    let helps = args.protocol.options(args.quiet)?;
+    let condition = text.map(|text| cantap_protocols::condition(text, &decoder, &helps)).transpose();
     let condition = condition.context("condition")?;
     if condition.is_none() && args.ids.is_empty() && args.data.is_empty() {
         return Err(wrong(
@@ -105,7 +111,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let search = Search { ids: args.ids.clone(), data: args.data.clone(), condition };
     let mut records = args.read.open_either(args.input.as_ref(), &args.live)?;
     let mut sink = Sink::new(args, decoder, records.grows())?;
-    let found = find(args, &mut records, search, &mut sink)?;
+    let mut search = search;
+    let found = find(args, &mut records, &mut search, &mut sink)?;
+    if let Some(condition) = search.condition.as_ref().filter(|_| !args.quiet) {
+        protocols::tell_unheard(condition);
+    }
     sink.finish(found, &records.missing())?;
     if args.count {
         writeln!(std::io::stdout(), "{found}")?;
@@ -114,7 +124,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
 }
 
 /// Goes through the trace and hands on what was found with its context; returns how many were.
-fn find(args: &Args, records: &mut Records, mut search: Search, sink: &mut Sink) -> anyhow::Result<u64> {
+fn find(args: &Args, records: &mut Records, search: &mut Search, sink: &mut Sink) -> anyhow::Result<u64> {
     let before = args.before_context.unwrap_or(args.context).min(MAX_CONTEXT);
     let after = args.after_context.unwrap_or(args.context);
     let mut earlier: VecDeque<TraceRecord> = VecDeque::new();
@@ -128,12 +138,12 @@ fn find(args: &Args, records: &mut Records, mut search: Search, sink: &mut Sink)
                 sink.separate()?;
             }
             for record in earlier.drain(..) {
-                sink.show(&record, false)?;
+                sink.show(&record, None)?;
             }
-            sink.show(&record, true)?;
+            sink.show(&record, Some(search.condition.as_ref().map_or(&[], Condition::said)))?;
             (found, still_after, gap) = (found + 1, after, false);
         } else if still_after > 0 {
-            sink.show(&record, false)?;
+            sink.show(&record, None)?;
             still_after -= 1;
         } else if is_last {
             break;
@@ -189,7 +199,8 @@ impl Sink {
         }
     }
 
-    fn show(&mut self, record: &TraceRecord, found: bool) -> anyhow::Result<()> {
+    /// `found` is what was said with a record that was found; records around it have none.
+    fn show(&mut self, record: &TraceRecord, found: Option<&[String]>) -> anyhow::Result<()> {
         let message =
             record.frame().and_then(|frame| self.decoder.decode(record.channel, frame, &mut self.values));
         let message = message.map(|message| self.decoder.message(message));
@@ -207,11 +218,14 @@ impl Sink {
                     write!(out, "  {}:", message.name)?;
                     decode::write_values(out, message, &self.values)?;
                 }
+                for said in found.unwrap_or_default() {
+                    write!(out, "  {said}")?;
+                }
                 Ok(writeln!(out)?)
             }
             Kind::Json(out) => {
                 let mut object = serde_json::json!({
-                    "time_s": record.time_ns as f64 / 1e9, "channel": record.channel, "match": found,
+                    "time_s": record.time_ns as f64 / 1e9, "channel": record.channel, "match": found.is_some(),
                 });
                 match record.frame() {
                     Some(frame) => {
@@ -222,6 +236,9 @@ impl Sink {
                 }
                 if let Some(message) = message {
                     object["message"] = message.name.as_str().into();
+                }
+                if let Some(said) = found.filter(|said| !said.is_empty()) {
+                    object["said"] = said.into();
                 }
                 Ok(writeln!(out, "{object}")?)
             }

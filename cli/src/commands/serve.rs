@@ -300,7 +300,8 @@ enum Way {
 impl Way {
     #[cfg(feature = "tls")]
     fn of(args: &Args) -> anyhow::Result<Self> {
-        Ok(keys::server(args)?.map_or(Self::Plain, Self::Encrypted))
+        let (Some(files), Some(authority)) = (&args.tls, &args.clients) else { return Ok(Self::Plain) };
+        keys::server(files, authority).map(Self::Encrypted)
     }
 
     #[cfg(not(feature = "tls"))]

@@ -19,6 +19,7 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::input::ReadArgs;
 use crate::missing::{Missing, by_kind};
+use crate::protocols::{Known, ProtocolArgs};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -26,7 +27,8 @@ use crate::missing::{Missing, by_kind};
     cantap stats trace.log -b 500k\n  \
     cantap stats trace.blf -b 1M -b 2:250k --window 100ms --per-id\n  \
     cantap stats fd.asc -b 500k --data-bitrate 2M\n  \
-    cantap stats -d virtual -b 1M -t 10\n\n\
+    cantap stats -d virtual -b 1M -t 10\n  \
+    cantap stats workshop.log --protocols\n\n\
 A frame's load is its exact length, stuff bits and intermission included, over the time since the frame\n\
 before. Windows also count error frames, with their least length. Where frames were lost, the load is a\n\
 lower bound and says so.")]
@@ -67,6 +69,12 @@ pub struct Args {
     /// List every identifier with count, period, jitter and DLCs.
     #[arg(long)]
     per_id: bool,
+    /// Also tell how long responses took, by service, and which nodes there are with their states and trouble codes, by the protocols that
+    /// each channel shows.
+    #[arg(long)]
+    protocols: bool,
+    #[command(flatten)]
+    protocol: ProtocolArgs,
     /// Print one JSON object, identifiers included.
     #[arg(long)]
     json: bool,
@@ -99,10 +107,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     }
     let mut statistics = Statistics::new(options)?;
     let mut windows = args.windows.then(Windows::new).transpose()?;
+    let mut known = args.protocols.then(|| args.protocol.known(args.json)).transpose()?;
     let mut ended = Ok(());
     let mut missing = Missing::default();
     if let Some(mut live) = live {
-        ended = live::run(!args.json, &mut live, &mut statistics, &mut windows);
+        ended = live::run(!args.json, &mut live, &mut statistics, &mut windows, &mut known);
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {
@@ -115,9 +124,15 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
             for record in &batch {
                 statistics.push_with(record, &mut closed);
             }
+            if let Some(known) = &mut known {
+                known.take(&batch, true);
+            }
         }
         statistics.finish_with(&mut closed);
         missing = records.missing();
+    }
+    if let Some(known) = &mut known {
+        known.take(&[], false);
     }
     if statistics.channels().is_empty() {
         // Nothing was heard: the reason is all there is to say.
@@ -128,11 +143,14 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     // Its reader may have gone; that is an error as any other.
     let mut out = BufWriter::new(std::io::stdout().lock());
     if args.json {
-        write_json(&summary, &missing, windows, &mut out)?;
+        write_json(&summary, &missing, windows, known.as_ref(), &mut out)?;
     } else {
         out.write_all(table::text(&summary, &missing, args.per_id).as_bytes())?;
         if let Some(windows) = windows {
             write_windows(&summary, windows, &mut out)?;
+        }
+        if let Some(known) = &known {
+            out.write_all(known.text().as_bytes())?;
         }
         out.write_all(table::hint(&summary, args.per_id).as_bytes())?;
     }
@@ -146,6 +164,7 @@ fn write_json(
     summary: &Summary,
     missing: &Missing,
     windows: Option<Windows>,
+    known: Option<&Known>,
     out: &mut impl Write,
 ) -> anyhow::Result<()> {
     let object = serde_json::to_string(summary)?;
@@ -153,6 +172,8 @@ fn write_json(
     let (issues, left_out) = (missing.issues, serde_json::to_string(&by_kind(&missing.left_out))?);
     let share = missing.share_pct();
     let members = format!("{members},\"issues\":{issues},\"left_out\":{left_out},\"missing_pct\":{share}");
+    let protocols = known.map_or(String::new(), |known| format!(",\"protocols\":{}", known.object()));
+    let members = members + &protocols;
     let Some(windows) = windows else { return Ok(writeln!(out, "{members}}}")?) };
     write!(out, "{members},\"windows\":[")?;
     let mut comma = "";

@@ -219,6 +219,12 @@ impl Stops {
     }
 }
 
+/// One screen, and what was wrong first where nothing else could be read of a file.
+pub struct Once {
+    pub screen: Buffer,
+    pub nothing_read: Option<String>,
+}
+
 /// Watches for that time (a file: to its end), then returns the screen.
 pub fn once(
     origin: Origin,
@@ -227,7 +233,7 @@ pub fn once(
     orders: std::sync::mpsc::Receiver<Order>,
     size: (u16, u16),
     time: Duration,
-) -> anyhow::Result<Buffer> {
+) -> anyhow::Result<Once> {
     let is_file = matches!(origin, Origin::File(_));
     let model: Shared = Arc::new(Mutex::new(model));
     let thread = start(origin, &model, orders)?;
@@ -248,12 +254,16 @@ pub fn once(
         }
     }
     app.catch_up(&mut lock(&model));
-    let screen = screen(&mut app, &lock(&model), size)?;
+    let (screen, nothing_read) = {
+        let model = lock(&model);
+        let unread = model.unread.as_ref().filter(|_| model.first_ns.is_none());
+        (screen(&mut app, &model, size)?, unread.map(|(_, first)| first.clone()))
+    };
     let _ = app.orders.send(Order::Quit);
     if thread.join().is_err() {
         bail!("the source thread failed; please report this");
     }
-    Ok(screen)
+    Ok(Once { screen, nothing_read })
 }
 
 /// One screen of this size.

@@ -4,13 +4,12 @@ use std::path::{Path, PathBuf};
 
 use cantap::TraceRecord;
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
-use cantap_signals::condition::Condition;
-
 use cantap_signals::Decoder;
 use cantap_signals::trigger::{Trigger, Window};
 
 use super::model::Recording;
 use crate::advice;
+use crate::protocols;
 
 /// What is kept around an event where a condition is given.
 const WINDOW: Window = Window { pre_ns: 2_000_000_000, post_ns: 5_000_000_000, events: None };
@@ -43,7 +42,7 @@ impl Recorder {
         let trigger = match condition {
             None => None,
             Some(condition) => {
-                let condition = Condition::new(condition, decoder)
+                let condition = protocols::condition(condition, decoder)
                     .map_err(|error| anyhow::anyhow!("nothing is recorded: {}", advice::told(&error)))?;
                 Some(Trigger::new(condition, WINDOW))
             }

@@ -70,6 +70,9 @@ pub(crate) trait Encode: Send {
         0
     }
 
+    /// Has the next record of a channel say something more, where a record can.
+    fn remark(&mut self, _channel: u8, _text: &str) {}
+
     /// Appends the file's end. A file without any record gets its head here.
     fn finish(&mut self, out: &mut Vec<u8>, left_out: &mut LeftOut);
 
@@ -85,5 +88,26 @@ pub(crate) trait Encode: Send {
     /// How many of these bytes at the end of the file are whole records.
     fn whole(&self, bytes: &[u8]) -> usize {
         memchr::memrchr(b'\n', bytes).map_or(0, |end| end + 1)
+    }
+}
+
+/// The line in front of the first row of a table.
+pub(crate) struct HeadLine {
+    text: &'static str,
+    is_written: bool,
+}
+
+impl HeadLine {
+    /// Not written yet; `text` is without its line end.
+    pub(crate) const fn of(text: &'static str) -> Self {
+        Self { text, is_written: false }
+    }
+
+    /// Writes it, the first time.
+    pub(crate) fn write(&mut self, out: &mut Vec<u8>) {
+        if !std::mem::replace(&mut self.is_written, true) {
+            out.extend_from_slice(self.text.as_bytes());
+            out.push(b'\n');
+        }
     }
 }

@@ -1,8 +1,9 @@
 //! The writer that a path and the options ask for.
 
-use std::io;
+use std::io::{self, Write};
 use std::path::Path;
 
+use super::Format;
 use super::file_writer::FileWriter;
 use super::rotate::Rotating;
 use super::writer::{TraceWriter, WriteOptions};
@@ -16,4 +17,16 @@ pub fn create_writer(path: impl AsRef<Path>, options: &WriteOptions) -> io::Resu
     } else {
         Ok(Box::new(Rotating::create(path, options)?))
     }
+}
+
+/// Writes a trace to what only takes bytes, such as a pipe that is open already: a candump log, if the options name no format. It cannot
+/// be rotated.
+pub fn create_stream_writer(
+    stream: Box<dyn Write + Send>,
+    options: &WriteOptions,
+) -> io::Result<Box<dyn TraceWriter>> {
+    if !options.rotation.at.is_empty() {
+        return Err(io::Error::new(io::ErrorKind::InvalidInput, "a stream cannot be split into files"));
+    }
+    Ok(Box::new(FileWriter::to_stream(stream, options.format.unwrap_or(Format::Candump), options)?))
 }

@@ -1,6 +1,6 @@
 //! One file being written, in whichever format.
 
-use std::io;
+use std::io::{self, Write};
 use std::path::Path;
 
 use super::analyser::{CsvLayout, TableEncoder};
@@ -52,7 +52,7 @@ fn encoder_of(format: Format, options: &WriteOptions) -> io::Result<Box<dyn Enco
             Box::new(TableEncoder::new(CsvLayout(options.table), &options.zone))
         }
         Format::Csv(CsvDialect::Gvret) => Box::new(gvret::Encoder::default()),
-        Format::Pcapng => Box::new(pcapng::Encoder::default()),
+        Format::Pcapng => Box::new(pcapng::Encoder::new(options)),
         Format::Dif => Box::new(TableEncoder::new(DifLayout::new(options.table), &options.zone)),
         Format::Mf4 => Box::new(mf4::Encoder::default()),
         read_only => return Err(io::Error::new(io::ErrorKind::Unsupported, NotWritten(read_only))),
@@ -64,6 +64,14 @@ impl FileWriter {
         // Nothing is created, and nothing overwritten, for a format that is not written.
         let encoder = encoder_of(format_of(path, options)?, options)?;
         Ok(Self::with(Output::create(path)?, encoder))
+    }
+
+    pub(crate) fn to_stream(
+        stream: Box<dyn Write + Send>,
+        format: Format,
+        options: &WriteOptions,
+    ) -> io::Result<Self> {
+        Ok(Self::with(Output::Stream(stream), encoder_of(format, options)?))
     }
 
     #[cfg(test)]
@@ -132,6 +140,10 @@ impl TraceWriter for FileWriter {
         self.encoder.flush(&mut self.buffer, &mut self.left_out);
         self.drain()?;
         self.output.flush()
+    }
+
+    fn remark(&mut self, channel: u8, text: &str) {
+        self.encoder.remark(channel, text);
     }
 
     fn finish(mut self: Box<Self>) -> io::Result<LeftOut> {

@@ -128,6 +128,11 @@ impl Format {
         )
     }
 
+    /// Whether its files begin with something that is no record, so that one of no bytes at all is none.
+    pub(crate) fn has_head(self) -> bool {
+        !matches!(self, Self::Candump | Self::CandumpScreen | Self::Crtd | Self::Printer)
+    }
+
     /// Every format that is written.
     pub fn written() -> impl Iterator<Item = Self> {
         Self::all().filter(|format| format.is_written())

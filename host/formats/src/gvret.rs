@@ -1,7 +1,7 @@
 //! SavvyCAN's own CSV, which GVRET boards and their tools write too: `Time Stamp,ID,Extended,Dir,Bus,LEN,D1,…,D8`, times in
 //! microseconds, buses from 0. Older files have no direction.
 
-use super::codec::Encode;
+use super::codec::{Encode, HeadLine};
 use super::found::Row;
 use super::frame_fields::{FdFields, FrameFields, Payload, direction, hex_byte, identifier};
 use super::issue::Fault;
@@ -65,23 +65,21 @@ impl RowDecoder {
     }
 }
 
-/// Writes the rows.
-#[derive(Default)]
-pub(crate) struct Encoder {
-    started: bool,
-}
+/// What this writes in front of the rows.
+const WRITTEN_HEAD: &str = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8";
 
-impl Encoder {
-    fn start(&mut self, out: &mut Vec<u8>) {
-        if !std::mem::replace(&mut self.started, true) {
-            out.extend_from_slice(b"Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n");
-        }
+/// Writes the rows.
+pub(crate) struct Encoder(HeadLine);
+
+impl Default for Encoder {
+    fn default() -> Self {
+        Self(HeadLine::of(WRITTEN_HEAD))
     }
 }
 
 impl Encode for Encoder {
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
         let (frame, direction) = match &record.event {
             TraceEvent::Frame { frame, .. } if frame.is_remote() => {
                 return left_out.note("remote frames, which SavvyCAN's CSV has no form for");
@@ -124,7 +122,7 @@ impl Encode for Encoder {
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
     }
 }
 

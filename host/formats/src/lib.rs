@@ -62,7 +62,7 @@ mod zone;
 
 pub(crate) use analyser::date as date_time_ns;
 pub use analyser::{DifConvention, LineEnd, TableStyle};
-pub use create::create_writer;
+pub use create::{create_stream_writer, create_writer};
 pub use csv::CsvDialect;
 pub use format::{Format, NotWritten, UnknownFormat};
 pub use issue::{Fault, Place, ReadIssue};
@@ -70,7 +70,7 @@ pub use left_out::LeftOut;
 pub use reader::{NothingRead, OpenError, ReadOptions, TraceReader, open_reader};
 pub use rotation::{BadRotation, RotateAt, Rotation};
 pub use trc::TrcVersion;
-pub use writer::{TraceWriter, WriteOptions};
+pub use writer::{ChannelInfo, TraceWriter, WriteOptions};
 pub use zone::{UnknownZone, Zone};
 
 /// Seconds with a fraction, as nanoseconds.

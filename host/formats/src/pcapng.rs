@@ -3,7 +3,8 @@
 //! The few blocks that matter are read and written here and not by the `pcap-file` crate: a file may grow
 //! while it is read, reading must go on behind a damaged block, and times may lie before 1970. Each
 //! channel is an interface `can0`, `can1`…; what is not a frame is an error frame as SocketCAN has
-//! them, and a loss also a drop count.
+//! them. A loss is also a drop count and a comment, and what a channel had and lost altogether is in statistics blocks: at the end, and
+//! regularly for somebody who reads meanwhile.
 
 mod decode;
 mod encode;
@@ -16,6 +17,7 @@ pub(crate) const SECTION_HEADER: u32 = 0x0A0D_0D0A;
 const INTERFACE_DESCRIPTION: u32 = 1;
 const OBSOLETE_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
+const STATISTICS: u32 = 5;
 const ENHANCED_PACKET: u32 = 6;
 
 /// How a section header shows its byte order.
@@ -26,12 +28,21 @@ const BLOCK_FRAME_BYTES: usize = 12;
 
 // Options.
 const END: u16 = 0;
+const COMMENT: u16 = 1;
 const IF_NAME: u16 = 2;
+const IF_DESCRIPTION: u16 = 3;
+const IF_SPEED: u16 = 8;
 const IF_TSRESOL: u16 = 9;
 const IF_TSOFFSET: u16 = 14;
 const EPB_FLAGS: u16 = 2;
 const EPB_DROPCOUNT: u16 = 4;
+const ISB_IFRECV: u16 = 4;
+const ISB_IFDROP: u16 = 5;
+const ISB_USRDELIV: u16 = 8;
 const SHB_USERAPPL: u16 = 4;
+
+/// The comment on a frame whose time is only an upper bound, by which it is known again.
+const LATE: &str = "the time is only an upper bound";
 
 /// The direction's bits in a packet's flags, and the value for a sent packet.
 const DIRECTION: u32 = 3;
@@ -39,9 +50,16 @@ const OUTBOUND: u32 = 2;
 
 #[cfg(test)]
 mod tests {
+    use std::io::{self, Write};
+    use std::sync::{Arc, Mutex};
+    use std::time::Duration;
+
     use super::super::tests;
-    use crate::{Format, WriteOptions};
+    use super::{ISB_IFDROP, ISB_IFRECV, ISB_USRDELIV, STATISTICS};
+    use crate::{ChannelInfo, Format, WriteOptions, create_stream_writer};
     use cantap_trace::testing::{data_record, record_or_fd};
+    use cantap_trace::{Direction, TraceEvent, TraceRecord};
+    use cantap_wire::record::LossStage;
     use proptest::prelude::*;
 
     proptest! {
@@ -57,10 +75,13 @@ mod tests {
         let options = WriteOptions { format: Some(Format::Pcapng), ..WriteOptions::default() };
         let (whole, _) = tests::write_with(&options, &records);
         let (read, issues) = tests::read(Format::Pcapng, &whole[..whole.len() - 10]);
-        assert_eq!((read.len(), issues.len()), (99, 1));
+        assert_eq!((read.len(), issues.len()), (100, 1));
         assert!(issues[0].contains("ends inside a block"), "{issues:?}");
+        let (read, issues) = tests::read(Format::Pcapng, &whole[..whole.len() - 64 - 10]);
+        assert_eq!((read.len(), issues.len()), (99, 1));
         let mut damaged = whole.clone();
-        let block = whole.len() - 50 * 48;
+        // Behind the packets are the statistics of one channel.
+        let block = whole.len() - 64 - 50 * 48;
         damaged[block + 4..block + 8].copy_from_slice(&[0xFF; 4]);
         let (read, issues) = tests::read(Format::Pcapng, &damaged);
         assert_eq!((read.len(), issues.len()), (99, 1), "{issues:?}");
@@ -96,5 +117,117 @@ mod tests {
              (1.500000) can0 20000088#0000040000000000\n"
         );
         assert_eq!(issues, Vec::<String>::new());
+    }
+
+    /// What went through a pipe so far.
+    #[derive(Clone, Default)]
+    struct Pipe(Arc<Mutex<Vec<u8>>>);
+
+    impl Write for Pipe {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            self.0.lock().unwrap().extend_from_slice(bytes);
+            Ok(bytes.len())
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    /// Types of blocks, and what is in them.
+    fn blocks(mut bytes: &[u8]) -> Vec<(u32, Vec<u8>)> {
+        let mut blocks = Vec::new();
+        while let Some((head, _)) = bytes.split_first_chunk::<8>() {
+            let [kind, len] = [0, 4].map(|at| u32::from_le_bytes(head[at..at + 4].try_into().unwrap()));
+            let (block, rest) = bytes.split_at(len as usize);
+            blocks.push((kind, block[8..block.len() - 4].to_vec()));
+            bytes = rest;
+        }
+        blocks
+    }
+
+    /// Interface, received, dropped, delivered.
+    fn statistics(blocks: &[(u32, Vec<u8>)]) -> Vec<[u64; 4]> {
+        let of = blocks.iter().filter(|(kind, _)| *kind == STATISTICS).map(|(_, body)| {
+            let option = |code: u16| {
+                let wanted = [code.to_le_bytes(), 8_u16.to_le_bytes()].concat();
+                let at =
+                    12 + body[12..].chunks(12).position(|option| option.starts_with(&wanted)).unwrap() * 12;
+                u64::from_le_bytes(body[at + 4..at + 12].try_into().unwrap())
+            };
+            let interface = u32::from_le_bytes(body[..4].try_into().unwrap());
+            [u64::from(interface), option(ISB_IFRECV), option(ISB_IFDROP), option(ISB_USRDELIV)]
+        });
+        of.collect()
+    }
+
+    fn event(channel: u8, event: TraceEvent) -> TraceRecord {
+        TraceRecord { time_ns: 5, channel, event }
+    }
+
+    #[test]
+    fn whoever_reads_along_has_the_head_at_once_and_the_counts_regularly() {
+        let channels = [1, 2].map(|channel| ChannelInfo {
+            channel,
+            bitrate_bps: Some(500_000),
+            description: "listening".to_owned(),
+        });
+        let options = WriteOptions {
+            format: Some(Format::Pcapng),
+            channels: channels.to_vec(),
+            statistics_every: Some(Duration::ZERO),
+            ..WriteOptions::default()
+        };
+        let pipe = Pipe::default();
+        let mut writer = create_stream_writer(Box::new(pipe.clone()), &options).unwrap();
+        let seen = || blocks(&pipe.0.lock().unwrap());
+        writer.flush().unwrap();
+        assert_eq!(seen().iter().map(|(kind, _)| *kind).collect::<Vec<_>>(), [0x0A0D_0D0A, 1, 1, 5, 5]);
+        assert_eq!(statistics(&seen()), [[0, 0, 0, 0], [1, 0, 0, 0]]);
+        assert!(seen()[1].1.windows(9).any(|text| text == b"listening"));
+        writer.write(&data_record(0)).unwrap();
+        let lost = TraceEvent::Lost { stage: Some(LossStage::Queue), count: 7, at_least: false };
+        writer.write(&event(2, lost)).unwrap();
+        writer.flush().unwrap();
+        let channel = u64::from(data_record(0).channel - 1);
+        assert_eq!(channel, 0);
+        assert_eq!(statistics(&seen())[2..], [[0, 1, 0, 1], [1, 7, 7, 0]]);
+        writer.finish().unwrap();
+        assert_eq!(statistics(&seen())[4..], [[0, 1, 0, 1], [1, 7, 7, 0]]);
+    }
+
+    /// Wireshark shows drop counts only to those who look for them.
+    #[test]
+    fn a_loss_is_said_in_words_and_a_remark_stands_on_the_next_packet() {
+        let options = WriteOptions { format: Some(Format::Pcapng), ..WriteOptions::default() };
+        let pipe = Pipe::default();
+        let mut writer = create_stream_writer(Box::new(pipe.clone()), &options).unwrap();
+        let loss = |stage, count, at_least| TraceEvent::Lost { stage, count, at_least };
+        writer.write(&event(1, loss(Some(LossStage::Controller), 3, true))).unwrap();
+        writer.remark(1, "from here on at 250000 bit/s");
+        writer.write(&event(2, loss(None, 1, false))).unwrap();
+        writer.write(&event(1, TraceEvent::GAP)).unwrap();
+        writer.finish().unwrap();
+        let blocks = blocks(&pipe.0.lock().unwrap());
+        let packets: Vec<String> = blocks
+            .iter()
+            .filter(|(kind, _)| *kind == 6)
+            .map(|(_, body)| String::from_utf8_lossy(&body[36..]).into_owned())
+            .collect();
+        assert!(packets[0].contains("at least 3 frames were lost here in the CAN controller"), "{packets:?}");
+        assert!(
+            packets[1].contains("1 frame was lost here") && !packets[1].contains("250000"),
+            "{packets:?}"
+        );
+        assert!(packets[2].contains("from here on at 250000 bit/s"), "{packets:?}");
+        assert!(packets[2].contains("between device and computer, nobody knows how many"), "{packets:?}");
+    }
+
+    #[test]
+    fn a_time_that_is_only_an_upper_bound_is_still_one_when_it_is_read() {
+        let frame =
+            |late| TraceEvent::Frame { frame: "123#11".parse().unwrap(), direction: Direction::Tx, late };
+        let records = [event(1, frame(true)), event(1, frame(false))];
+        assert_eq!(tests::round_trip(Format::Pcapng, &records), records);
     }
 }

@@ -266,6 +266,14 @@ impl TraceReader {
             Ok(Found::Issue(place, fault)) => Beyond::Issue(self.issue(place, fault)),
             Ok(Found::End) => {
                 self.ended = true;
+                let is_empty = self.head.is_empty() && self.input.offset() == 0 && self.issues == 0;
+                if is_empty && !self.input.follows() {
+                    if self.format.has_head() {
+                        let fault = Fault::malformed(format!("the head of a file in {}", self.format), b"");
+                        return Beyond::Issue(self.issue(Place::Offset(0), fault));
+                    }
+                    self.notes.note("the file is empty");
+                }
                 if self.input.compressed_data_cut() {
                     let place = Place::Offset(self.input.offset());
                     return Beyond::Issue(self.issue(place, Fault::Truncated("the compressed data")));

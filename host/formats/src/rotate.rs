@@ -116,6 +116,10 @@ impl TraceWriter for Rotating {
         self.current.flush()
     }
 
+    fn remark(&mut self, channel: u8, text: &str) {
+        self.current.remark(channel, text);
+    }
+
     fn finish(mut self: Box<Self>) -> io::Result<LeftOut> {
         self.left_out.merge(&self.current.finish()?);
         Ok(self.left_out)

@@ -9,7 +9,7 @@ use std::process::Command;
 
 use cantap_formats::{CsvDialect, Format, ReadOptions, TrcVersion, open_reader};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
-use cantap_wire::record::ErrorState;
+use cantap_wire::record::{ErrorState, LossStage};
 use peers::{peers_are_required, python, python_can, python_can_reads, run};
 use traces::{directory, file_name, frames, odd, read, real, split, write};
 
@@ -260,6 +260,38 @@ fn wireshark_and_we_read_each_others_pcapng_files() {
         assert_eq!(issues, Vec::<String>::new(), "{name}");
         assert!(read == records, "{name}: {} of {}", read.len(), records.len());
     }
+}
+
+/// Beside the error frame, which says that frames were lost but not to everybody how many.
+#[test]
+fn wireshark_shows_losses_as_drop_counts_with_words_and_sent_frames_as_outbound() {
+    let directory = directory("wireshark_losses");
+    let path = directory.join("lost.pcapng");
+    let frame = |direction| TraceEvent::Frame { frame: "123#11".parse().unwrap(), direction, late: false };
+    let lost = |count| TraceEvent::Lost { stage: Some(LossStage::Queue), count, at_least: false };
+    let events = [(1, frame(Direction::Rx)), (2, lost(42)), (1, frame(Direction::Tx)), (2, lost(1))];
+    let records = events.map(|(channel, event)| TraceRecord { time_ns: 5, channel, event });
+    write(&path, Format::Pcapng, &records);
+    let mut command = Command::new("tshark");
+    command.arg("-r").arg(&path).args(["-T", "fields", "-E", "separator=|"]);
+    for field in ["frame.interface_name", "frame.drop_count", "frame.comment", "frame.packet_flags_direction"]
+    {
+        command.args(["-e", field]);
+    }
+    let Some(text) = run("tshark", &["--version"], &mut command) else { return };
+    assert_eq!(
+        text.lines().collect::<Vec<_>>(),
+        [
+            "can0|||",
+            "can1|42|42 frames were lost here in the device's queue|",
+            "can0|||0x00000002",
+            "can1|1|1 frame was lost here in the device's queue|",
+        ]
+    );
+    // The statistics are no packets, and nothing that it would complain about.
+    let mut command = Command::new("capinfos");
+    let Some(text) = run("capinfos", &["--version"], command.arg("-M").arg(&path)) else { return };
+    assert_eq!(text.matches("Number of stat entries = 1").count(), 2, "{text}");
 }
 
 /// Times from the first record: can-utils' asc2log takes the date only in one language.

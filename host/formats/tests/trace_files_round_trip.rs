@@ -99,9 +99,9 @@ proptest! {
     }
 }
 
-/// The format that carries everything carries times that no other does.
+/// The formats that carry everything carry times that no other does.
 #[test]
-fn nanoseconds_and_late_marks_survive_in_our_own_table() {
+fn nanoseconds_and_late_marks_survive_in_our_own_table_and_in_pcapng() {
     let directory = directory("own_table");
     let event =
         TraceEvent::Frame { frame: "123#DEADBEEF".parse().unwrap(), direction: Direction::Tx, late: true };
@@ -110,11 +110,14 @@ fn nanoseconds_and_late_marks_survive_in_our_own_table() {
         channel: 255,
         event,
     });
-    let path = directory.join("full.csv");
-    assert!(write(&path, Format::Csv(CsvDialect::Full), &records).is_empty());
-    assert_eq!(read(&path), (records.to_vec(), Vec::new()));
+    let carrying = [Format::Csv(CsvDialect::Full), Format::Pcapng];
+    for format in carrying {
+        let path = directory.join(file_name(format, ""));
+        assert!(write(&path, format, &records).is_empty(), "{format}");
+        assert_eq!(read(&path), (records.to_vec(), Vec::new()), "{format}");
+    }
     // The others say what they leave out.
-    for format in Format::written().filter(|format| *format != Format::Csv(CsvDialect::Full)) {
+    for format in Format::written().filter(|format| !carrying.contains(format)) {
         let left_out = write(&directory.join(file_name(format, "")), format, &records);
         let late: Vec<_> = left_out.iter().filter(|(what, _)| what.contains("upper bounds")).collect();
         assert!(matches!(late[..], [(_, 3)]), "{format}: {left_out:?}");

@@ -4,7 +4,7 @@ use cantap_trace::TraceEvent;
 use cantap_trace::TraceRecord;
 use cantap_wire::record::ErrorState;
 
-use crate::Event;
+use crate::{Event, Party, Protocol};
 
 /// Makes events of one protocol from the records of a trace.
 ///
@@ -16,6 +16,28 @@ pub trait Assembler {
 
     /// The trace has ended: appends what was under way, as unfinished.
     fn finish(&mut self, events: &mut Vec<Event>);
+
+    /// Appends the transfers that have begun and have not ended so far.
+    fn under_way(&self, _: &mut Vec<UnderWay>) {}
+}
+
+/// A transfer of several frames that has not ended so far.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct UnderWay {
+    /// The channel, from 1.
+    pub channel: u8,
+    /// The protocol that carries it.
+    pub protocol: Protocol,
+    /// Who sends it.
+    pub from: Party,
+    /// To whom.
+    pub to: Party,
+    /// The stamp of its first frame, in nanoseconds.
+    pub start_ns: i64,
+    /// Bytes that have arrived.
+    pub received: u32,
+    /// Bytes of the whole, where that was said.
+    pub length: Option<u32>,
 }
 
 /// Whether frames of the record's channel may be missing here: lost, or not heard by a controller that was off the bus.

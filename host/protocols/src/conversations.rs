@@ -10,7 +10,7 @@ use crate::devicenet::DeviceNet;
 use crate::diagnostics::Diagnostics;
 use crate::iso_tp::{IsoTp, Pair};
 use crate::j1939::J1939;
-use crate::{Assembler, Event, Evidence, Protocol};
+use crate::{Assembler, Event, Evidence, Protocol, UnderWay};
 
 /// What to listen for.
 #[derive(Clone, Debug, Default)]
@@ -30,58 +30,89 @@ pub struct Options {
 
 /// Takes records and gives the events of all protocols, in the order in which they are complete.
 pub struct Conversations {
-    assemblers: Vec<(u16, Box<dyn Assembler + Send>)>,
-    /// The protocols of each channel.
-    spoken: Box<[u16; 256]>,
+    readers: Vec<Box<dyn Assembler + Send + Sync>>,
+    /// Which of them read each channel, a bit each.
+    of_channel: Box<[u8; 256]>,
     wanted: u16,
 }
 
 const DIAGNOSTICS: u16 =
     Protocol::IsoTp.bit() | Protocol::Uds.bit() | Protocol::Kwp2000.bit() | Protocol::Obd.bit();
+/// Both have the same frames: one reader tells them apart by their groups.
+const VEHICLE_AND_BOAT: u16 = Protocol::J1939.bit() | Protocol::Nmea2000.bit();
 
 impl Conversations {
     /// Listens for what the options say.
     pub fn new(options: &Options) -> Self {
         let bits = |protocols: &[Protocol]| protocols.iter().fold(0, |bits, protocol| bits | protocol.bit());
         let wanted = if options.protocols.is_empty() { u16::MAX } else { bits(&options.protocols) };
-        let mut spoken = Box::new([if options.spoken.is_some() { 0 } else { u16::MAX }; 256]);
-        for evidence in options.spoken.iter().flatten() {
-            spoken[usize::from(evidence.channel)] |= evidence.protocol.bit();
-        }
-        let anywhere = spoken.iter().fold(0, |all, protocols| all | protocols);
         // Without a survey and a choice, frames that two protocols could claim would be read twice.
-        let chosen = options.spoken.is_some() || !options.protocols.is_empty();
-        let speaks = |protocol: Protocol| chosen && wanted & anywhere & protocol.bit() != 0;
-        let mut assemblers: Vec<(u16, Box<dyn Assembler + Send>)> = Vec::new();
-        if wanted == Protocol::IsoTp.bit() {
-            assemblers.push((wanted, Box::new(IsoTp::new(&options.pairs, true))));
-        } else if wanted & DIAGNOSTICS != 0 {
-            assemblers.push((DIAGNOSTICS, Box::new(Diagnostics::new(&options.pairs, true))));
-        }
-        let mut add = |protocol: Protocol, make: fn(Option<Arc<Decoder>>) -> J1939| {
-            if speaks(protocol) {
-                assemblers.push((protocol.bit(), Box::new(make(options.decoder.clone()))));
-            }
+        let everywhere = match (&options.spoken, options.protocols.is_empty()) {
+            (Some(_), _) => 0,
+            (None, true) => DIAGNOSTICS,
+            (None, false) => wanted,
         };
-        add(Protocol::J1939, J1939::new);
-        add(Protocol::Nmea2000, J1939::nmea2000);
-        if speaks(Protocol::CanOpen) {
-            assemblers.push((Protocol::CanOpen.bit(), Box::new(CanOpen::new(options.sheets.clone()))));
+        let mut spoken = [everywhere; 256];
+        for evidence in options.spoken.iter().flatten() {
+            spoken[usize::from(evidence.channel)] |= evidence.protocol.bit() & wanted;
         }
-        if speaks(Protocol::DeviceNet) {
-            assemblers.push((Protocol::DeviceNet.bit(), Box::new(DeviceNet::new())));
+        let mut this = Self { readers: Vec::new(), of_channel: Box::new([0; 256]), wanted };
+        let decoder = || options.decoder.clone();
+        this.add(
+            &spoken,
+            |spoken| spoken & DIAGNOSTICS != 0,
+            || {
+                if wanted == Protocol::IsoTp.bit() {
+                    Box::new(IsoTp::new(&options.pairs, true))
+                } else {
+                    Box::new(Diagnostics::new(&options.pairs, true))
+                }
+            },
+        );
+        let family = |spoken: u16| spoken & VEHICLE_AND_BOAT;
+        this.add(
+            &spoken,
+            |spoken| family(spoken) == Protocol::J1939.bit(),
+            || Box::new(J1939::new(decoder())),
+        );
+        let is_boat = |spoken| family(spoken) == Protocol::Nmea2000.bit();
+        this.add(&spoken, is_boat, || Box::new(J1939::nmea2000(decoder())));
+        let is_both = |spoken| family(spoken) == VEHICLE_AND_BOAT;
+        this.add(&spoken, is_both, || Box::new(J1939::with_nmea2000(decoder())));
+        let canopen = |spoken: u16| spoken & Protocol::CanOpen.bit() != 0;
+        this.add(&spoken, canopen, || Box::new(CanOpen::new(options.sheets.clone())));
+        let devicenet = |spoken: u16| spoken & Protocol::DeviceNet.bit() != 0;
+        this.add(&spoken, devicenet, || Box::new(DeviceNet::new()));
+        this
+    }
+
+    /// Adds a reader for the channels that need it, if there are any.
+    fn add(
+        &mut self,
+        spoken: &[u16; 256],
+        needs: impl Fn(u16) -> bool,
+        make: impl FnOnce() -> Box<dyn Assembler + Send + Sync>,
+    ) {
+        let bit = 1 << self.readers.len();
+        let mut is_needed = false;
+        for (readers, spoken) in self.of_channel.iter_mut().zip(spoken) {
+            if needs(*spoken) {
+                *readers |= bit;
+                is_needed = true;
+            }
         }
-        Self { assemblers, spoken, wanted }
+        if is_needed {
+            self.readers.push(make());
+        }
     }
 
     /// Takes the next record and appends what it completes.
     pub fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
-        let spoken = self.spoken[usize::from(record.channel)];
+        let mut readers = self.of_channel[usize::from(record.channel)];
         let before = events.len();
-        for (protocols, assembler) in &mut self.assemblers {
-            if spoken & *protocols != 0 {
-                assembler.take(record, events);
-            }
+        while readers != 0 {
+            self.readers[readers.trailing_zeros() as usize].take(record, events);
+            readers &= readers - 1;
         }
         if events.len() > before {
             self.keep_wanted(before, events);
@@ -91,19 +122,32 @@ impl Conversations {
     /// The trace has ended: appends what was under way.
     pub fn finish(&mut self, events: &mut Vec<Event>) {
         let before = events.len();
-        for (_, assembler) in &mut self.assemblers {
-            assembler.finish(events);
+        for reader in &mut self.readers {
+            reader.finish(events);
         }
         self.keep_wanted(before, events);
     }
 
+    /// The transfers that have begun and have not ended, in the order in which they began.
+    pub fn under_way(&self) -> Vec<UnderWay> {
+        let mut under_way = Vec::new();
+        self.readers.iter().for_each(|reader| reader.under_way(&mut under_way));
+        under_way.sort_by_key(|transfer| transfer.start_ns);
+        under_way
+    }
+
     fn keep_wanted(&self, before: usize, events: &mut Vec<Event>) {
-        if self.wanted != u16::MAX {
-            let mut at = 0;
-            events.retain(|event| {
-                at += 1;
-                at <= before || self.wanted & event.protocol.bit() != 0
-            });
+        if self.wanted == u16::MAX {
+            return;
         }
+        // Only what is new: the caller may keep all events of a long trace in the same vector.
+        let mut end = before;
+        for at in before..events.len() {
+            if self.wanted & events[at].protocol.bit() != 0 {
+                events.swap(end, at);
+                end += 1;
+            }
+        }
+        events.truncate(end);
     }
 }

@@ -267,15 +267,25 @@ impl fmt::Display for Value {
             Self::Hex(value, digits) => write!(f, "0x{value:0width$X}", width = usize::from(*digits)),
             Self::Real(value) => write_real(f, *value),
             Self::Text(text) => write!(f, "\"{}\"", text.escape_debug()),
-            Self::Bytes(bytes) => {
-                let mut bytes = bytes.iter();
-                let Some(first) = bytes.next() else { return f.write_str("nothing") };
-                write!(f, "{first:02X}")?;
-                bytes.try_for_each(|byte| write!(f, " {byte:02X}"))
-            }
+            Self::Bytes(bytes) if bytes.is_empty() => f.write_str("nothing"),
+            Self::Bytes(bytes) => f.write_str(&hex(bytes)),
             Self::Missing => f.write_str("not available"),
         }
     }
+}
+
+/// `62 F1 90`.
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    const DIGITS: &[u8; 16] = b"0123456789ABCDEF";
+    let mut text = String::with_capacity(bytes.len() * 3);
+    for (at, byte) in bytes.iter().enumerate() {
+        if at > 0 {
+            text.push(' ');
+        }
+        text.push(char::from(DIGITS[usize::from(byte >> 4)]));
+        text.push(char::from(DIGITS[usize::from(byte & 15)]));
+    }
+    text
 }
 
 /// Seven decimals at most, as positions have, and none that say nothing.

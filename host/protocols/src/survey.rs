@@ -8,6 +8,7 @@ use crate::devicenet;
 use crate::diagnostics::Diagnostics;
 use crate::j1939::{self, Header};
 use crate::nmea2000;
+use crate::relatives::{Relative, Relatives};
 use crate::{Assembler, Event, Protocol};
 
 /// Looks at the first records of a trace or a bus.
@@ -20,6 +21,7 @@ pub struct Survey {
     extended: FxHashMap<u8, [u32; 3]>,
     canopen: FxHashMap<u8, canopen::CanOpenSigns>,
     devicenet: FxHashMap<u8, devicenet::DeviceNetSigns>,
+    relatives: FxHashMap<u8, Relatives>,
 }
 
 /// That a channel speaks a protocol.
@@ -45,6 +47,7 @@ impl Survey {
         if let Some(frame) = record.frame() {
             self.canopen.entry(record.channel).or_default().take(frame);
             self.devicenet.entry(record.channel).or_default().take(frame);
+            self.relatives.entry(record.channel).or_default().take(frame);
         }
         let header =
             record.frame().filter(|frame| !frame.is_remote()).and_then(|frame| Header::of(frame.id()));
@@ -63,6 +66,16 @@ impl Survey {
                 *self.seen.entry((event.channel, event.protocol)).or_default() += 1;
             }
         }
+    }
+
+    /// Protocols that are recognised and not read, by channel.
+    pub fn relatives(&self) -> Vec<(u8, Relative)> {
+        let found = self.relatives.iter().flat_map(|(channel, relatives)| {
+            relatives.found().into_iter().map(|relative| (*channel, relative))
+        });
+        let mut found: Vec<_> = found.collect();
+        found.sort_unstable();
+        found
     }
 
     /// What was seen, by channel.

@@ -392,7 +392,14 @@ fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Hear
             // There is room for one; if nobody waits any more, that is fine.
             let _ = answer.try_send(result.clone());
         }
-        Decoded::Ended { .. } => heard.end = Some(SessionOver::Suspended),
+        Decoded::Ended { reason, .. } => {
+            heard.end = Some(match reason {
+                EndReason::Configured => SessionOver::Configured,
+                EndReason::Suspended | EndReason::BoardLost | EndReason::ServerEnded => {
+                    SessionOver::Suspended
+                }
+            });
+        }
         Decoded::Corrupt(Corruption::OutOfOrder { .. }) => heard.end = Some(SessionOver::StreamWentBack),
         Decoded::Corrupt(_) | Decoded::OtherProtocol(_) => {}
     });

@@ -223,9 +223,138 @@ fn lines_are_a_candump_log_of_all_channels() {
     }
 }
 
+/// The protocol page's own texts, in its order, and what is said to each: `>` is the client's, `<` the server's, where a time is
+/// written as T, and `!` what another node sends.
+const PAGE: &str = "
+> < can0 B 500000 0 0 0 0 0 0 0 >
+< < ok >
+> < can0 C 0 0 0 >
+< < ok >
+> < open can0 >
+< < ok >
+> < add 1 0 123 8 11 22 33 44 55 66 77 88 >
+< < error 20000004 T 83 01 00 00 00 00 00 00  >
+> < add 0 20000 123 4 42 42 42 42 >
+> < update 123 3 11 22 33 >
+> < delete 123 >
+> < send 123 0 >
+> < send 1AAAAAAA 2 1 F1 >
+> < sendrtr 123 0 >
+> < sendrtr 1AAAAAAA 2 >
+> < filter 0 0 123 1 FF >
+! 123#11
+< < frame 123 T 11  >
+! 123#11
+> < filter 0 0 123 8 FF 00 F8 00 00 00 00 00 >
+! 123#1100080000000000
+< < frame 123 T 11 00 08 00 00 00 00 00  >
+! 123#11FF0F0000000000
+> < filter 1 500000 123 8 FF 00 F8 00 00 00 00 00 >
+! 123#2200080000000000
+< < frame 123 T 22 00 08 00 00 00 00 00  >
+> < muxfilter 0 0 123 2 FF 00 00 00 00 00 00 00 33 FF FF FF FF FF FF FF >
+! 123#3301000000000000
+< < frame 123 T 33 01 00 00 00 00 00 00  >
+! 123#5601000000000000
+> < subscribe 0 0 123 >
+! 123#11223344
+< < frame 123 T 11 22 33 44  >
+> < unsubscribe 123 >
+! 123#11223344
+> < echo >
+< < echo >
+> < rawmode >
+< < ok >
+! 123#11223344
+< < frame 123 T 11223344 >
+! 123#R4
+< < rtr 123 T 4 >
+> < bcmmode >
+< < ok >
+! 123#11223344
+> < controlmode >
+< < ok >
+> < isotpmode >
+< < error unknown command >
+";
+
+#[test]
+fn the_protocol_page_is_a_transcript() {
+    let board = board("load=0");
+    let server = listen(&board, Role::Send);
+    let other = other(&board);
+    let mut records = other.records();
+    let mut client = Client::new(&server);
+    for line in PAGE.lines().filter(|line| !line.is_empty()) {
+        let (who, text) = line.split_at(2);
+        match who {
+            "> " => client.say(text),
+            "! " => {
+                // What the client has said is done by then.
+                assert_eq!(client.ask("< echo >"), "< echo >", "before {line}");
+                send(&other, text);
+                while records.next().unwrap().unwrap().frame().is_none_or(|frame| frame.to_string() != text) {
+                }
+            }
+            _ => {
+                let said = client.one();
+                let mut words: Vec<&str> = said.split(' ').collect();
+                if words[1] != "error" || words.len() > 6 {
+                    words.iter_mut().filter(|word| word.contains('.')).for_each(|word| *word = "T");
+                }
+                assert_eq!(words.join(" "), text);
+            }
+        }
+    }
+    // Every frame of the page's examples, the interval of 10 µs aside, which no bus carries.
+    other.stop().unwrap();
+    assert_eq!(client.next(Duration::from_millis(300)), None);
+}
+
+/// What an interval holds back is told when it is over, also where nothing else is on the bus.
+#[test]
+fn a_throttled_frame_is_told_on_a_silent_bus() {
+    let board = board("load=0");
+    let server = listen(&board, Role::Listen);
+    let other = other(&board);
+    let mut client = Client::new(&server);
+    assert_eq!(client.ask("< open can0 >"), "< ok >");
+    client.say("< subscribe 0 300000 123 >");
+    assert_eq!(client.ask("< echo >"), "< echo >");
+    for frame in ["123#01", "123#02", "123#03"] {
+        send(&other, frame);
+    }
+    assert_eq!(timeless(&client.one()), "frame 123 01  >");
+    assert_eq!(timeless(&client.one()), "frame 123 03  >");
+}
+
+/// SavvyCAN compares what one read gives it, and connects anew after ten seconds without a byte.
+#[test]
+fn savvycan_stays_connected_on_a_silent_bus() {
+    let board = board("load=0");
+    let server = listen(&board, Role::Listen);
+    let mut stream = TcpStream::connect(server.address().unwrap()).unwrap();
+    stream.set_read_timeout(Some(Duration::from_millis(9500))).unwrap();
+    let mut read = |said: &str| {
+        stream.write_all(said.as_bytes()).unwrap();
+        let mut bytes = [0; 4096];
+        let len = stream.read(&mut bytes).unwrap();
+        String::from_utf8_lossy(&bytes[..len]).into_owned()
+    };
+    assert_eq!(read(""), "< hi >");
+    assert_eq!(read("< open can0 >"), "< ok >");
+    assert_eq!(read("< rawmode >"), "< ok >");
+    let silent_since = Instant::now();
+    assert_eq!(read(""), "< echo >");
+    assert!(silent_since.elapsed() > Duration::from_secs(5), "a bus with traffic needs none");
+}
+
 /// Finds the server by its beacon, hears frames with and without data, sends, has one sent again and again.
 const PROGRAM: &str = r#"
 import sys, time, can
+from can.interfaces.socketcand import socketcand
+# What the server says on a silent bus, python-can passes over.
+assert socketcand.convert_ascii_message_to_can_message("< echo >") is None
 port = int(sys.argv[1])
 found = [config for config in can.detect_available_configs("socketcand") if config["port"] == port]
 assert [config["channel"] for config in found] == ["can0", "can1"], found

@@ -7,12 +7,16 @@ use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
+use cantap::device::{Link, is_idle};
 use cantap::wire::Refusal;
 use cantap::wire::message::{ChannelConfig, Mode, Role};
 use cantap::{Channel, Device, DeviceError};
 use cantap_serve::listen::Listening;
 use cantap_serve::tls::{self, Files, Keys};
 use cantap_serve::{Board, Settings};
+use rcgen::{
+    CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, Issuer, KeyPair, date_time_ymd,
+};
 
 const BITRATE_BPS: u32 = 500_000;
 
@@ -132,6 +136,130 @@ fn strangers_and_wrong_certificates_hear_nothing() {
     served.connect("localhost", &good).unwrap();
     let said = served.said.lock().unwrap().join("\n");
     assert!(said.contains("was not let in"), "{said}");
+}
+
+/// A certificate of the folder's authority, for `hosts` and `purpose`, good from 1 January of one year to that of another.
+fn forge(
+    folder: &Path,
+    name: &str,
+    hosts: &[&str],
+    purpose: ExtendedKeyUsagePurpose,
+    years: [i32; 2],
+) -> Files {
+    let authority = KeyPair::from_pem(&std::fs::read_to_string(folder.join("ca-key.pem")).unwrap()).unwrap();
+    let mut issuer = CertificateParams::default();
+    issuer.distinguished_name = DistinguishedName::new();
+    issuer.distinguished_name.push(DnType::OrganizationName, "cantap");
+    issuer.distinguished_name.push(DnType::CommonName, "authority");
+    let hosts: Vec<String> = hosts.iter().map(|host| (*host).to_owned()).collect();
+    let mut params = CertificateParams::new(hosts).unwrap();
+    params.extended_key_usages = vec![purpose];
+    let [since, until] = years.map(|year| date_time_ymd(year, 1, 1));
+    (params.not_before, params.not_after) = (since, until);
+    let key = KeyPair::generate().unwrap();
+    let certificate = params.signed_by(&key, &Issuer::from_params(&issuer, &authority)).unwrap();
+    let files = Keys::files(folder, name);
+    std::fs::write(&files.certificate, certificate.pem()).unwrap();
+    std::fs::write(&files.key, key.serialize_pem()).unwrap();
+    files
+}
+
+const ROLE: &str = "send.role.cantap.invalid";
+const NOW: [i32; 2] = [2020, 2060];
+
+/// Each is of the right authority, and differs from a good one in one thing.
+#[test]
+fn certificates_that_are_expired_not_valid_yet_or_name_no_role_let_nobody_in() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Send);
+    let client = |name: &str, hosts: &[&str], years: [i32; 2]| {
+        forge(folder.path(), name, hosts, ExtendedKeyUsagePurpose::ClientAuth, years)
+    };
+    normal(&served.connect("localhost", &client("good", &[ROLE], NOW)).unwrap()).unwrap();
+    for (files, part) in [
+        (client("expired", &[ROLE], [2010, 2020]), "expired"),
+        (client("early", &[ROLE], [2090, 2100]), "not valid yet"),
+        (client("no-role", &["localhost"], NOW), "says nothing of what it may do"),
+        (client("other-role", &["root.role.cantap.invalid"], NOW), "says nothing of what it may do"),
+    ] {
+        let refused = served.connect("localhost", &files).err().expect("it is refused");
+        wait_until(|| {
+            let said = served.said.lock().unwrap().join("\n");
+            said.contains("was not let in") && said.contains(part)
+        });
+        served.said.lock().unwrap().clear();
+        assert!(!refused.is_empty());
+    }
+    assert_eq!(served.board.clients(), 0);
+    // And the other way round: a client goes to no server whose certificate is over, or is a client's.
+    for (purpose, years) in
+        [(ExtendedKeyUsagePurpose::ServerAuth, [2010, 2020]), (ExtendedKeyUsagePurpose::ClientAuth, NOW)]
+    {
+        let of_server = forge(folder.path(), "other-server", &["localhost"], purpose, years);
+        let server = tls::Server::new(&of_server).unwrap();
+        let listening =
+            tls::listen(&served.board, "127.0.0.1:0".parse().unwrap(), Role::Send, &server).unwrap();
+        let address = format!("localhost:{}", listening.address().unwrap().port());
+        let good = Keys::files(folder.path(), "good");
+        assert!(tls::connect(&address, &good).is_err(), "{years:?}");
+    }
+}
+
+fn wait_until(mut holds: impl FnMut() -> bool) {
+    let deadline = Instant::now() + Duration::from_secs(10);
+    while !holds() {
+        assert!(Instant::now() < deadline, "it did not come to be");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Peers that stop in the middle: of TLS' first message, of the handshake a byte at a time, and after it without a word of ours.
+#[test]
+fn half_open_peers_are_let_go_and_the_others_are_served_meanwhile() {
+    let folder = tempfile::tempdir().unwrap();
+    let served = serve(folder.path(), Role::Send);
+    let good = Keys::in_folder(folder.path()).unwrap().add_client("good", Role::Listen).unwrap();
+    let address = served.listening.address().unwrap();
+    // TLS' record header of a first message that does not come.
+    let begun = |rest: &[u8]| {
+        let mut stream = TcpStream::connect(address).unwrap();
+        stream.write_all(&[0x16, 3, 1, 2, 0]).unwrap();
+        stream.write_all(rest).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(12))).unwrap();
+        stream
+    };
+    let mut silent = begun(&[]);
+    let mut slow = begun(&[1]);
+    let mut drip = slow.try_clone().unwrap();
+    std::thread::spawn(move || {
+        while drip.write_all(&[0]).is_ok() {
+            std::thread::sleep(Duration::from_millis(30));
+        }
+    });
+    let started = Instant::now();
+    // Through the handshake, and then nothing.
+    let mute = tls::connect(&format!("localhost:{}", address.port()), &good).unwrap();
+    wait_until(|| served.board.clients() == 1);
+    let device = served.connect("localhost", &good).unwrap();
+    device.listen(Channel::Can1, BITRATE_BPS).unwrap();
+    for stream in [&mut silent, &mut slow] {
+        let mut heard = Vec::new();
+        let _ = stream.read_to_end(&mut heard);
+        assert!(heard.len() <= 7, "{heard:?}");
+    }
+    let Link { mut reader, .. } = mute;
+    let mut heard = [0; 64];
+    let closed = loop {
+        match reader.read(&mut heard) {
+            Err(error) if is_idle(&error) => {}
+            closed => break closed,
+        }
+    };
+    assert!(matches!(closed, Ok(0) | Err(_)), "{closed:?}");
+    assert!(started.elapsed() < Duration::from_secs(9), "{:?}", started.elapsed());
+    assert_eq!(served.board.clients(), 1);
+    assert!(device.counters().channels[0].received > 100);
+    assert_eq!(device.counters().channels[0].lost(), 0);
 }
 
 #[test]

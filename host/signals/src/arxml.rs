@@ -12,10 +12,15 @@ use roxmltree::{Document, Node};
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{self, ByteOrder};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
-use super::{validate, xml};
+use super::{buses, validate, xml};
 
-/// Parses an ARXML file's content; `file` is its name for messages to the user.
+/// Parses an ARXML file's content, all of its buses (CAN clusters); `file` is its name for messages to the user.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
+    parse_bus(file, bytes, None)
+}
+
+/// As [`parse`], only the bus of this name.
+pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
     let root = document.root_element();
@@ -26,20 +31,42 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     let mut reader = Reader { document: &document, by_path: HashMap::new(), faults: Vec::new() };
     reader.index(root);
     let triggerings = root.descendants().filter(|node| node.tag_name().name() == "CAN-FRAME-TRIGGERING");
+    let triggerings: Vec<_> = triggerings.map(|node| (node, bus_of(node))).collect();
+    let mut names: Vec<String> = Vec::new();
+    for (_, name) in &triggerings {
+        if !name.is_empty() && !names.contains(name) {
+            names.push(name.clone());
+        }
+    }
+    let buses = buses::chosen(file, names, bus)?;
     let mut seen = HashSet::new();
     let mut messages = Vec::new();
-    for triggering in triggerings {
+    let mut ids = Vec::new();
+    for (triggering, name) in triggerings {
+        let at = buses.iter().position(|bus| *bus == name);
+        if at.is_none() && bus.is_some() {
+            continue;
+        }
         let Some(message) = reader.message(triggering) else { continue };
         // A frame that several channels send is one message.
         if seen.insert((message.id, message.name.clone())) {
+            ids.extend(at.map(|at| (message.id, at)));
             messages.push(message);
         }
     }
+    reader.faults.extend(buses::warning(&buses, ids));
     if messages.is_empty() && reader.faults.is_empty() {
         let reason = "no CAN frame is in it: there is no CAN-FRAME-TRIGGERING".to_owned();
         return Err(xml::faulty(file, reason));
     }
-    validate::finish(file, messages, reader.faults)
+    let database = validate::finish(file, messages, reader.faults)?;
+    Ok(Database { buses, ..database })
+}
+
+/// The name of the bus, a cluster, that a frame is sent on; empty where it is in none.
+fn bus_of(triggering: Node<'_, '_>) -> String {
+    let cluster = triggering.ancestors().find(|node| node.tag_name().name() == "CAN-CLUSTER");
+    cluster.map(short_name).unwrap_or_default()
 }
 
 struct Reader<'a> {

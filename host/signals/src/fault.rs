@@ -126,6 +126,17 @@ pub enum FaultKind {
         /// The earlier message.
         other: String,
     },
+    /// Several buses are read as one, and messages of different ones have the same identifier.
+    #[error(
+        "the file has the buses {}, of which {messages} messages have the identifier of another bus's; name the channel's bus behind \
+         the file, as in FILE#{}", .buses.join(", "), .buses[0]
+    )]
+    SeveralBuses {
+        /// Their names, at least two.
+        buses: Vec<String>,
+        /// Messages whose identifier is also that of one on a bus before.
+        messages: usize,
+    },
     /// Two signals of a message with the same name.
     #[error("the message has another signal of this name")]
     DuplicateSignal,
@@ -161,6 +172,7 @@ impl FaultKind {
                 | Self::ZeroFactor
                 | Self::OutsideMessage { .. }
                 | Self::DuplicateId { .. }
+                | Self::SeveralBuses { .. }
                 | Self::DuplicateSignal
                 | Self::NoMultiplexer(_)
                 | Self::UnknownSymbol

@@ -1,7 +1,7 @@
 //! Databases from KCD files, Kayak's XML.
 //!
-//! A bit offset counts, for big-endian signals, from the highest bit of the first byte on. All buses of a file are read; which
-//! of them a channel is, the file does not say.
+//! A bit offset counts, for big-endian signals, from the highest bit of the first byte on. Which of a file's buses a channel is, the
+//! file does not say.
 
 use cantap_wire::Id;
 use roxmltree::{Document, Node};
@@ -9,10 +9,15 @@ use roxmltree::{Document, Node};
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{ByteOrder, wire_position};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
-use super::{validate, xml};
+use super::{buses, validate, xml};
 
-/// Parses a KCD file's content; `file` is its name for messages to the user.
+/// Parses a KCD file's content, all of its buses; `file` is its name for messages to the user.
 pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
+    parse_bus(file, bytes, None)
+}
+
+/// As [`parse`], only the bus of this name.
+pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
     let root = document.root_element();
@@ -22,10 +27,21 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
         return Err(xml::faulty(file, reason));
     }
     let mut faults = Vec::new();
-    let buses = root.children().filter(|node| node.has_tag_name_of("Bus"));
-    let nodes = buses.flat_map(|bus| bus.children().filter(|node| node.has_tag_name_of("Message")));
-    let messages = nodes.filter_map(|node| message(&document, node, &mut faults)).collect();
-    validate::finish(file, messages, faults)
+    let nodes: Vec<_> = root.children().filter(|node| node.has_tag_name_of("Bus")).collect();
+    let name = |node: &Node| node.attribute("name").unwrap_or_default().to_owned();
+    let buses = buses::chosen(file, nodes.iter().map(name).collect(), bus)?;
+    let mut messages = Vec::new();
+    let mut ids = Vec::new();
+    for (at, node) in nodes.iter().filter(|node| buses.contains(&name(node))).enumerate() {
+        for node in node.children().filter(|node| node.has_tag_name_of("Message")) {
+            let message = message(&document, node, &mut faults);
+            ids.extend(message.iter().map(|message| (message.id, at)));
+            messages.extend(message);
+        }
+    }
+    faults.extend(buses::warning(&buses, ids));
+    let database = validate::finish(file, messages, faults)?;
+    Ok(Database { buses, ..database })
 }
 
 /// Elements by local name: writers differ in what they do with the namespace.

@@ -9,6 +9,7 @@
 #![forbid(unsafe_code)]
 
 pub mod arxml;
+mod buses;
 mod clean;
 pub mod condition;
 pub mod dbc;
@@ -47,23 +48,33 @@ pub use number::Number;
 pub use plan::SignalValue;
 pub use select::{Selection, SelectionError, Suggestion};
 
-/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file.
+/// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. Of a KCD or ARXML file
+/// with several buses, `FILE#BUS` is one; without it, all are read as one.
 ///
 /// Faults that leave a database usable are in [`Database::warnings`].
 pub fn load(path: &Path) -> Result<Database, DatabaseError> {
     let file = path.display().to_string();
-    let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default();
-    let parse: fn(&str, &[u8]) -> Result<Database, DatabaseError> = match suffix.to_ascii_lowercase().as_str()
-    {
-        "dbc" => dbc::parse,
-        "arxml" => arxml::parse,
-        "kcd" => kcd::parse,
-        "sym" => sym::parse,
-        "toml" => file::parse,
-        _ => return Err(DatabaseError::UnknownKind { file }),
-    };
-    match std::fs::read(path) {
-        Ok(bytes) => parse(&file, &bytes),
-        Err(source) => Err(DatabaseError::Read { file, source }),
+    let (path, bus) = with_bus(path);
+    let suffix = path.extension().and_then(|suffix| suffix.to_str()).unwrap_or_default().to_ascii_lowercase();
+    let read = || std::fs::read(path).map_err(|source| DatabaseError::Read { file: file.clone(), source });
+    match suffix.as_str() {
+        "arxml" => arxml::parse_bus(&file, &read()?, bus),
+        "kcd" => kcd::parse_bus(&file, &read()?, bus),
+        "dbc" | "sym" | "toml" if bus.is_some() => {
+            Err(xml::faulty(&file, format!("a .{suffix} file is of one bus; leave out what follows the #")))
+        }
+        "dbc" => dbc::parse(&file, &read()?),
+        "sym" => sym::parse(&file, &read()?),
+        "toml" => file::parse(&file, &read()?),
+        _ => Err(DatabaseError::UnknownKind { file }),
+    }
+}
+
+/// A file's path and the bus behind it. A file that has `#` in its name is itself.
+fn with_bus(path: &Path) -> (&Path, Option<&str>) {
+    let parts = path.to_str().filter(|_| !path.exists()).and_then(|text| text.rsplit_once('#'));
+    match parts {
+        Some((file, bus)) if !file.is_empty() && !bus.is_empty() => (Path::new(file), Some(bus)),
+        _ => (path, None),
     }
 }

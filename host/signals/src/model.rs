@@ -20,6 +20,8 @@ pub struct Database {
     pub file: String,
     /// The messages, in the file's order.
     pub messages: Vec<Message>,
+    /// The buses that the file has and that were read, by name; empty where its format knows none.
+    pub buses: Vec<String>,
     /// What is wrong with the file although it can be used.
     pub warnings: Vec<Fault>,
 }

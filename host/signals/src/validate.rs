@@ -35,7 +35,8 @@ pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Res
     for fault in faults.iter_mut().filter(|fault| !fault.kind.is_warning()) {
         fault.kind = FaultKind::LeftOut(fault.kind.clone().into());
     }
-    let mut database = Database { file: file.to_owned(), messages: usable, warnings: faults };
+    let mut database =
+        Database { file: file.to_owned(), messages: usable, buses: Vec::new(), warnings: faults };
     tidy(&mut database);
     Ok(database)
 }

@@ -39,6 +39,50 @@ fn a_kcd_file_is_read() {
     assert_eq!(decode(database, "0B2#0107FFF0"), "Mux=1 Big=-2 One=7");
 }
 
+const TWO_BUSES: &str = r#"<NetworkDefinition><Document name="x"/>
+ <Bus name="Motor"><Message id="0x10" name="Engine"><Signal name="Speed" offset="0" length="8"/></Message>
+  <Message id="0x11" name="Oil"><Signal name="Temp" offset="0" length="8"/></Message></Bus>
+ <Bus name="Comfort"><Message id="0x10" name="Seat"><Signal name="Heat" offset="0" length="8"/></Message>
+  <Message id="0x12" name="Door"><Signal name="Open" offset="0" length="1"/></Message></Bus></NetworkDefinition>"#;
+
+/// Both were read as one, so that a frame of the one was shown as the other's.
+#[test]
+fn one_bus_of_several_is_read_and_all_of_them_as_one_are_warned_of() {
+    let folder = std::path::Path::new(env!("CARGO_TARGET_TMPDIR")).join("buses");
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("car.kcd"), TWO_BUSES).unwrap();
+    std::fs::write(folder.join("a#b.kcd"), TWO_BUSES).unwrap();
+    std::fs::write(folder.join("one.dbc"), "VERSION \"\"\nBO_ 1 A: 1 X\n").unwrap();
+    let load = |name: &str| cantap_signals::load(&folder.join(name));
+    let names = |database: &Database| -> Vec<String> {
+        database.messages.iter().map(|message| message.name.clone()).collect()
+    };
+    for (bus, messages, frame, text) in
+        [("Motor", ["Engine", "Oil"], "010#05", "Speed=5"), ("Comfort", ["Seat", "Door"], "010#05", "Heat=5")]
+    {
+        let database = load(&format!("car.kcd#{bus}")).unwrap();
+        assert_eq!(
+            (names(&database), database.buses.join(" ")),
+            (messages.map(str::to_owned).to_vec(), bus.to_owned())
+        );
+        assert_eq!(database.warnings, []);
+        assert_eq!(decode(database, frame), text);
+    }
+    let all = load("car.kcd").unwrap();
+    assert_eq!((all.messages.len(), all.buses.join(" ")), (4, "Motor Comfort".to_owned()));
+    let warning = all.warnings[0].to_string();
+    assert!(
+        warning.contains("the buses Motor, Comfort, of which 1 message") && warning.contains("FILE#Motor"),
+        "{warning}"
+    );
+    assert_eq!(load("a#b.kcd").unwrap().messages.len(), 4);
+    assert_eq!(load("a#b.kcd#Comfort").unwrap().messages.len(), 2);
+    let error = load("car.kcd#Body").unwrap_err().to_string();
+    assert!(error.contains("no bus \"Body\" in it; its buses are Motor, Comfort"), "{error}");
+    assert!(load("one.dbc#A").unwrap_err().to_string().contains("is of one bus"));
+    assert!(matches!(load("gone.kcd#A"), Err(DatabaseError::Read { .. })));
+}
+
 const SYM: &str = "FormatVersion=6.0 // Do not edit this line!\nTitle=\"x\"\n\n{ENUMS}\nEnum=Gear(0=\"Park\", // a comment\n  1=\"Drive\")\n\n\
                    {SIGNALS}\nSig=\"A B\" unsigned 8 -m /u:\"m s\" /f:0.5 /o:-1 // speed\n\n{SENDRECEIVE}\n\n[\"Sym\"]\nID=00000123h-00000124h // two\n\
                    Len=4\nCycleTime=20\nMux=First 0,8 1Ah -m\nSig=\"A B\" 8\n\n[\"Sym\"]\nLen=4\nMux=Second 0,8 1Bh -m\nVar=G Gear 8,4\n\n\
@@ -77,6 +121,20 @@ const ARXML: &str = r#"<?xml version="1.0" encoding="UTF-8"?>
 #[test]
 fn an_arxml_file_is_read() {
     let database = arxml::parse("x.arxml", ARXML.as_bytes()).unwrap();
+    assert_eq!(database.buses, ["C"]);
+    let other = ARXML.replace("</ELEMENTS>", r"<CAN-CLUSTER><SHORT-NAME>D</SHORT-NAME><CAN-FRAME-TRIGGERING><FRAME-REF>/P/G</FRAME-REF>
+        <CAN-ADDRESSING-MODE>EXTENDED</CAN-ADDRESSING-MODE><IDENTIFIER>291</IDENTIFIER></CAN-FRAME-TRIGGERING></CAN-CLUSTER>
+        <CAN-FRAME><SHORT-NAME>G</SHORT-NAME><FRAME-LENGTH>3</FRAME-LENGTH></CAN-FRAME></ELEMENTS>");
+    let both = arxml::parse("x.arxml", other.as_bytes()).unwrap();
+    assert_eq!((both.messages.len(), both.buses.join(" ")), (2, "C D".to_owned()));
+    assert!(
+        both.warnings
+            .iter()
+            .any(|warning| warning.to_string().contains("the buses C, D, of which 1 message"))
+    );
+    let one = arxml::parse_bus("x.arxml", other.as_bytes(), Some("D")).unwrap();
+    assert_eq!((one.messages.len(), one.messages[0].name.as_str()), (1, "G"));
+    assert!(arxml::parse_bus("x.arxml", other.as_bytes(), Some("E")).is_err());
     let message = &database.messages[0];
     assert_eq!((database.messages.len(), message.name.as_str(), message.cycle_ms), (1, "F", Some(250)));
     let signal = &message.signals[0];

@@ -148,6 +148,8 @@ pub enum DeviceError {
 pub enum SessionOver {
     /// The device says that the computer suspended it.
     Suspended,
+    /// The device says that the computer configured it anew.
+    Configured,
     /// The device refuses requests because there is none.
     Refused,
     /// Another program greets the device on our port.
@@ -174,6 +176,7 @@ impl fmt::Display for SessionOver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Suspended => "this computer put the device to sleep, as when it sleeps itself",
+            Self::Configured => "this computer set the device up anew, as when its driver is loaded again",
             Self::Refused => {
                 "this computer slept, or the device was restarted, or another program took it over"
             }

@@ -291,6 +291,7 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
                         EndReason::Suspended => SessionOver::Suspended,
                         EndReason::BoardLost => SessionOver::BoardLost,
                         EndReason::ServerEnded => SessionOver::ServerEnded,
+                        EndReason::Configured => SessionOver::Configured,
                     });
                 }
             });

@@ -32,6 +32,9 @@ pub enum Fault {
     SessionLost,
     /// It was suspended and resumed: after what it had captured it says that the session has ended. Its last batch is lost.
     Suspended,
+    /// It was configured anew: at the next request it says what it had captured, that the session has ended, and refuses. Its last
+    /// batch is lost.
+    Configured,
     /// It was greeted by another program, which has the session now.
     Stolen,
     /// Its batches begin anew.
@@ -295,16 +298,25 @@ impl FakeDevice {
         }
     }
 
+    /// Frames, of which a batch is lost, and the end.
+    fn end_session(&mut self, reason: EndReason) {
+        self.hear_frames();
+        self.lose();
+        let mut out = [0; MAX_ENCODED];
+        let len = self.batch.end(reason, self.ticks(), &mut out);
+        self.write(&out[..len]);
+    }
+
     /// Answers as a device does, and hears a numbered frame on each open channel every [`FRAME_EVERY`]. From `frames` of them
     /// on it misbehaves. Returns when the host closes the port, or when it vanishes.
     pub fn run(&mut self, fault: Fault, frames: u32) {
-        let (mut next, mut greeted, mut turned) = (Instant::now(), false, false);
+        let (mut next, mut greeted, mut turned, mut told) = (Instant::now(), false, false, false);
         loop {
             let is_bad = self.status.channels.iter().any(|channel| channel.frames >= frames);
             let fault = if is_bad || turned { fault } else { Fault::None };
             if fault != Fault::None && !std::mem::replace(&mut turned, true) {
                 match fault {
-                    Fault::SessionLost => greeted = false,
+                    Fault::SessionLost | Fault::Configured => greeted = false,
                     Fault::Stolen => {
                         self.begin_session();
                         let strangers_id = self.strangers_id;
@@ -312,11 +324,7 @@ impl FakeDevice {
                     }
                     Fault::Suspended => {
                         greeted = false;
-                        self.hear_frames();
-                        self.lose();
-                        let mut out = [0; MAX_ENCODED];
-                        let len = self.batch.end(EndReason::Suspended, self.ticks(), &mut out);
-                        self.write(&out[..len]);
+                        self.end_session(EndReason::Suspended);
                     }
                     Fault::GoesBack => self.batch.restart(),
                     _ => {}
@@ -332,6 +340,9 @@ impl FakeDevice {
                         std::thread::sleep(Duration::from_millis(300));
                     }
                     greeted |= matches!(command, Command::Hello { .. });
+                    if fault == Fault::Configured && !greeted && !std::mem::replace(&mut told, true) {
+                        self.end_session(EndReason::Configured);
+                    }
                     if greeted {
                         self.handle(id, &command, fault != Fault::NeverStops);
                     } else {

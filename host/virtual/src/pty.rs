@@ -98,7 +98,15 @@ impl Line {
     fn carry_in(&self, mut device: PipeWriter) {
         let mut bytes = [0; 4096];
         while !self.is_over() {
-            if self.wait_for(PollFlags::IN, LOOK_EVERY).contains(PollFlags::HUP) {
+            let events = self.wait_for(PollFlags::IN, LOOK_EVERY);
+            if events.contains(PollFlags::HUP) {
+                // What a program wrote before it closed the port is its own, and not the next one's.
+                if events.contains(PollFlags::IN) {
+                    self.open();
+                    while let Ok(len @ 1..) = rustix::io::read(&self.terminal, &mut bytes[..]) {
+                        self.hand_in(&bytes[..len], &mut device);
+                    }
+                }
                 self.close();
                 std::thread::sleep(LOOK_EVERY);
                 continue;

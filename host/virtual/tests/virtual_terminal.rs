@@ -99,6 +99,21 @@ fn nothing_of_a_closed_session_reaches_the_next_program() {
     }
 }
 
+/// They waited in the terminal, and were done, or refused, when the next program opened it.
+#[test]
+fn requests_that_a_program_left_unread_are_not_the_next_one_s() {
+    let terminal = open_terminal("load=0".parse().unwrap()).unwrap();
+    for _ in 0..10 {
+        let mut port = open(terminal.path());
+        port.write_all(&hello(77)).unwrap();
+        assert_eq!(answers(&mut port, &mut Decoder::new(), 1), [77]);
+        let left: Vec<u8> = (5000..5050).flat_map(|id| request(id, Command::Time)).collect();
+        port.write_all(&left).unwrap();
+        drop(port);
+        std::thread::sleep(Duration::from_millis(100));
+    }
+}
+
 #[test]
 fn the_first_request_is_answered_however_soon_the_port_is_opened_again() {
     let terminal = open_terminal("load=100,frames=std8".parse().unwrap()).unwrap();

@@ -8,11 +8,12 @@ use crate::can::MasterReset;
 use crate::cpu::{Bus, Cpu, Memories, State};
 use crate::elf::Image;
 use crate::memory_map as map;
-use crate::probe::{Change, Probe};
+use crate::probe::{Change, Probe, Task};
 use crate::profile::Profile;
 use crate::rom::{self, Start};
+use crate::soc::access::SharedBoard;
 use crate::soc::rcc::{CRYSTAL_START_US, Crystal, ResetCause};
-use crate::soc::{Board, RECEIVE_PINS, SharedBoard, bootloader};
+use crate::soc::{Board, RECEIVE_PINS, bootloader};
 use crate::stop::{Reason, Stopped};
 use crate::timing::Bound;
 use crate::trace::Trace;
@@ -214,14 +215,16 @@ impl Machine {
         self.profile.take()
     }
 
-    /// The exceptions that ran since the probe was reset, `span` cycles ago: name, how often, and their share of the time in per cent,
-    /// without what interrupted them.
-    pub fn tasks(&self, span: u64) -> Vec<(String, u64, f64)> {
+    /// The exceptions that ran since the probe was reset, `span` cycles ago.
+    pub fn tasks(&self, span: u64) -> Vec<Task> {
+        let probe = self.probe();
         (0..crate::probe::EXCEPTIONS as u16)
-            .filter(|number| self.probe().entries(*number) > 0)
-            .map(|number| {
-                let share = 100.0 * self.probe().cycles(number) as f64 / span.max(1) as f64;
-                (self.exception_name(number), self.probe().entries(number), share)
+            .filter(|number| probe.entries(*number) > 0)
+            .map(|number| Task {
+                name: self.exception_name(number),
+                entries: probe.entries(number),
+                percent: 100.0 * probe.cycles(number) as f64 / span.max(1) as f64,
+                longest_us: self.setup.clock.to_us(probe.longest_run(number)),
             })
             .collect()
     }

@@ -20,6 +20,19 @@ pub struct MaskedWindow {
     pub waited: bool,
 }
 
+/// What an exception cost, without what interrupted it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Task {
+    /// The exception's, as the image names its handler.
+    pub name: String,
+    /// How often it ran.
+    pub entries: u64,
+    /// Its share of the time, in per cent.
+    pub percent: f64,
+    /// Its longest run, in microseconds.
+    pub longest_us: f64,
+}
+
 /// A change of what the core does.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Change {
@@ -36,6 +49,7 @@ pub enum Change {
 pub struct Probe {
     cycles: [u64; EXCEPTIONS],
     entries: [u64; EXCEPTIONS],
+    longest_runs: [u64; EXCEPTIONS],
     asleep: u64,
     stalled: u64,
     since: u64,
@@ -43,7 +57,8 @@ pub struct Probe {
     longest: MaskedWindow,
     longest_with_one_waiting: MaskedWindow,
     fifo_max: [usize; 2],
-    active: Vec<u16>,
+    /// Exceptions under way, the innermost last, each with its own cycles so far.
+    active: Vec<(u16, u64)>,
 }
 
 impl Default for Probe {
@@ -51,6 +66,7 @@ impl Default for Probe {
         Self {
             cycles: [0; EXCEPTIONS],
             entries: [0; EXCEPTIONS],
+            longest_runs: [0; EXCEPTIONS],
             asleep: 0,
             stalled: 0,
             since: 0,
@@ -84,6 +100,11 @@ impl Probe {
     /// How often exception `number` was entered.
     pub fn entries(&self, number: u16) -> u64 {
         self.entries[usize::from(number)]
+    }
+
+    /// Core cycles of the longest run of exception `number`, without what interrupted it.
+    pub fn longest_run(&self, number: u16) -> u64 {
+        self.longest_runs[usize::from(number)]
     }
 
     /// Core cycles asleep.
@@ -133,19 +154,22 @@ impl Probe {
     pub(crate) fn step(&mut self, before: &State, after: &State, cycles: u64) -> Option<Change> {
         let (from, to) = (before.exception(), after.exception());
         if from == to {
-            self.cycles[usize::from(from) % EXCEPTIONS] += cycles;
+            self.account(from, cycles);
             return None;
         }
         // Only an entry pushes a frame; a return or a chained entry takes one off or leaves it.
         let entered = after.sp.wrapping_add(0x20) <= before.sp;
-        let owner = if entered { to } else { from };
-        self.cycles[usize::from(owner) % EXCEPTIONS] += cycles;
         if entered {
             self.enter(to);
+            self.account(to, cycles);
             return Some(Change::Enter(to));
         }
-        self.active.pop();
-        if self.active.last().copied().unwrap_or(0) == to {
+        self.account(from, cycles);
+        if let Some((exception, own)) = self.active.pop() {
+            let longest = &mut self.longest_runs[usize::from(exception) % EXCEPTIONS];
+            *longest = own.max(*longest);
+        }
+        if self.active.last().map_or(0, |(exception, _)| *exception) == to {
             return Some(Change::Leave(from));
         }
         self.enter(to);
@@ -154,7 +178,15 @@ impl Probe {
 
     fn enter(&mut self, exception: u16) {
         self.entries[usize::from(exception) % EXCEPTIONS] += 1;
-        self.active.push(exception);
+        self.active.push((exception, 0));
+    }
+
+    /// Counts cycles as an exception's own.
+    fn account(&mut self, exception: u16, cycles: u64) {
+        self.cycles[usize::from(exception) % EXCEPTIONS] += cycles;
+        if let Some((_, own)) = self.active.last_mut() {
+            *own += cycles;
+        }
     }
 
     /// Follows the masks; returns a window that has just ended.

@@ -6,8 +6,9 @@ use cantap_emu::Clock;
 use cantap_emu::bus::bits::FrameBits;
 use cantap_emu::bus::{BitTime, Node};
 use cantap_emu::cpu::{Bus, Memories};
+use cantap_emu::soc::Board;
+use cantap_emu::soc::access::SharedBoard;
 use cantap_emu::soc::rcc::Crystal;
-use cantap_emu::soc::{Board, SharedBoard};
 use cantap_emu::traffic::Script;
 
 const CLOCK: Clock = Clock::new(144_000_000);

@@ -2,7 +2,7 @@
 
 use core::cell::UnsafeCell;
 
-use cantap_firmware::ports::PACKET;
+use cantap_firmware::ports::{PACKET, PortHistory};
 use usb_device::bus::PollResult;
 use usb_device::endpoint::{EndpointAddress, EndpointType};
 use usb_device::{Result, UsbDirection, UsbError};
@@ -28,6 +28,17 @@ const NOTIFY_ACTIVE: u32 = epctl::USBAEP
 /// The notification endpoint's packets, as usbd-serial describes them.
 const NOTIFY_PACKET: u16 = 8;
 
+/// Whether the host has the port open.
+#[derive(Clone, Copy, PartialEq, Eq)]
+pub enum Line {
+    /// It has not: DTR is down.
+    Down,
+    /// It has.
+    Up,
+    /// It had when it configured the device anew, and has said nothing of DTR since.
+    Assumed,
+}
+
 /// The controller with its endpoints.
 pub struct Core {
     registers: Registers,
@@ -36,8 +47,8 @@ pub struct Core {
     bulk_out: BulkOut,
     notify_halted: bool,
     configured: bool,
-    /// The host has the port open, and has not configured the device anew since.
-    dtr: bool,
+    line: Line,
+    history: PortHistory,
     /// As usb-device knows it.
     suspended: bool,
 }
@@ -52,7 +63,8 @@ impl Core {
             bulk_out: BulkOut::new(),
             notify_halted: false,
             configured: false,
-            dtr: false,
+            line: Line::Down,
+            history: PortHistory { opened: 0, configured: 0 },
             suspended: false,
         }
     }
@@ -95,10 +107,10 @@ impl Core {
         registers.modify(DCFG, dcfg::DAD, 0);
         self.configured = false;
         self.notify_halted = false;
-        self.dtr = false;
+        self.line = Line::Down;
     }
 
-    /// SET_CONFIGURATION. Whoever had the port open has lost it.
+    /// SET_CONFIGURATION. Whoever had the port open has lost it, and may not know.
     pub fn configure(&mut self, configured: bool) {
         let Self { registers, bulk_in, bulk_out, .. } = self;
         bulk_in.configure(registers, configured);
@@ -107,7 +119,10 @@ impl Core {
         registers.write(Endpoint::input(NOTIFY_IN).ctl(), notify | epctl::SNAK);
         self.notify_halted = false;
         self.configured = configured;
-        self.dtr = false;
+        if self.line != Line::Down {
+            self.line = Line::Assumed;
+            self.history.configured = self.history.configured.wrapping_add(1);
+        }
     }
 
     /// SET_INTERFACE, or the end of a halt: both sides begin with DATA0 again.
@@ -229,12 +244,21 @@ impl Core {
 
     /// SET_CONTROL_LINE_STATE.
     pub fn set_dtr(&mut self, up: bool) {
-        self.dtr = up && self.configured;
+        let line = if up && self.configured { Line::Up } else { Line::Down };
+        if line == Line::Up && self.line != Line::Up {
+            self.history.opened = self.history.opened.wrapping_add(1);
+        }
+        self.line = line;
     }
 
-    /// Whether the host has the port open.
-    pub const fn dtr(&self) -> bool {
-        self.dtr
+    /// What the device knows of DTR.
+    pub const fn line(&self) -> Line {
+        self.line
+    }
+
+    /// What the host has done with the port.
+    pub const fn history(&self) -> PortHistory {
+        self.history
     }
 
     /// Begins a transfer to the host: see [`BulkIn::write`].

@@ -1,6 +1,6 @@
 //! The virtual COM port: usb-device and usbd-serial for what hosts ask, the bus itself for data.
 
-use cantap_firmware::ports::{PACKET, Port};
+use cantap_firmware::ports::{PACKET, Port, PortHistory};
 use cantap_wire::{USB_PID, USB_VID};
 use heapless::String;
 use stm32f4xx_hal::pac::{OTG_FS_DEVICE, OTG_FS_GLOBAL, OTG_FS_PWRCLK};
@@ -9,7 +9,7 @@ use usb_device::bus::UsbBusAllocator;
 use usb_device::device::{StringDescriptors, UsbDevice, UsbDeviceBuilder, UsbDeviceState, UsbRev, UsbVidPid};
 use usbd_serial::{CdcAcmClass, USB_CLASS_CDC};
 
-use super::bus::{Bus, Core, Shared};
+use super::bus::{Bus, Core, Line, Shared};
 use super::registers::Registers;
 use super::requests::Requests;
 
@@ -77,12 +77,16 @@ impl UsbPort {
 
 impl Port for UsbPort {
     fn is_open(&self) -> bool {
-        self.device.state() == UsbDeviceState::Configured && self.core.with(|core| core.dtr())
+        self.device.state() == UsbDeviceState::Configured && self.core.with(|core| core.line()) != Line::Down
     }
 
     fn is_suspended(&self) -> bool {
         // A pulled cable, too, shows as suspend, because nothing measures VBUS.
-        self.device.state() == UsbDeviceState::Suspend && self.core.with(|core| core.dtr())
+        self.device.state() != UsbDeviceState::Configured && self.core.with(|core| core.line()) != Line::Down
+    }
+
+    fn history(&self) -> PortHistory {
+        self.core.with(|core| core.history())
     }
 
     fn write(&mut self, bytes: &[u8]) -> Option<usize> {

@@ -13,7 +13,7 @@ use crate::peers::Peers;
 use crate::workspace;
 
 /// Some ten thousand frames of an NMEA 2000 bus, recorded by candump.
-const RECORDING: &str = "host/formats/tests/data/nmea2000.log.gz";
+pub(super) const RECORDING: &str = "host/formats/tests/data/nmea2000.log.gz";
 /// Frames of the trace made of it.
 const FRAMES: u64 = 1_000_000;
 /// Ours and log2asc take turns so often, and the best of each counts. python-can takes longer than the machine's moods.
@@ -47,7 +47,7 @@ pub fn run() -> Result<()> {
     let shell = workspace::shell()?;
     let files = Files::create()?;
     cmd!(shell, "cargo build --release --quiet -p cantap-cli").quiet().run()?;
-    make_trace(&files.log, FRAMES)?;
+    make_trace(&workspace::root().join(RECORDING), &files.log, FRAMES)?;
     let bytes = fs::metadata(&files.log)?.len();
     println!(
         "formats: {FRAMES} frames of {RECORDING} repeated, a candump log of {bytes} bytes, one conversion at a time"
@@ -65,10 +65,9 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// The recording over and over, with times that go on, up to this many frames.
-pub(super) fn make_trace(log: &Path, frames: u64) -> Result<()> {
-    let records: Vec<_> =
-        open_reader(workspace::root().join(RECORDING), &ReadOptions::default())?.collect::<Result<_, _>>()?;
+/// A recording over and over, with times that go on, up to this many frames.
+pub(super) fn make_trace(recording: &Path, log: &Path, frames: u64) -> Result<()> {
+    let records: Vec<_> = open_reader(recording, &ReadOptions::default())?.collect::<Result<_, _>>()?;
     let (first, last) = records.first().zip(records.last()).context("the recording is empty")?;
     let span_ns = last.time_ns - first.time_ns + 1_000_000;
     let mut writer = create_writer(log, &WriteOptions::default())?;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use anyhow::{Context, Result, ensure};
 use xshell::cmd;
 
-use super::formats::make_trace;
+use super::formats::{RECORDING, make_trace};
 use crate::workspace;
 
 /// Frames of the traces: ten times as many must not take more.
@@ -66,7 +66,7 @@ pub fn run() -> Result<()> {
     let mut rows: Vec<(String, Vec<f64>)> = Vec::new();
     for frames in FRAMES {
         let log = dir.join("trace.log");
-        make_trace(&log, frames)?;
+        make_trace(&workspace::root().join(RECORDING), &log, frames)?;
         let mut row = 0;
         let mut note = |name: String, mib: f64| {
             if row == rows.len() {

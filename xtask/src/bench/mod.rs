@@ -10,17 +10,23 @@ mod bus;
 #[cfg(feature = "bench")]
 mod clock;
 #[cfg(feature = "bench")]
+mod columns;
+#[cfg(feature = "bench")]
 mod emulated;
 #[cfg(feature = "bench")]
 mod extent;
 #[cfg(feature = "bench")]
 mod formats;
 #[cfg(feature = "bench")]
+mod graph;
+#[cfg(feature = "bench")]
 mod host;
 #[cfg(feature = "bench")]
 mod memory;
 #[cfg(feature = "bench")]
 mod monitor;
+#[cfg(all(feature = "bench", unix))]
+mod serve;
 #[cfg(feature = "bench")]
 mod signals;
 #[cfg(feature = "bench")]
@@ -41,6 +47,8 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
+    /// Sizes and times of Parquet, beside trace formats.
+    Columns,
     /// What the command occupies with long traces, in every format.
     Memory,
     /// Decoding signals, against cantools.
@@ -57,10 +65,14 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// Redraws of the live view's graph with five million values in the window.
+    Graph,
     /// The package for Python, beside python-can, cantools and asammdf.
     Python,
     /// The live view in tmux at full load: redraws, answers to keys, processor, memory, recording.
     Monitor,
+    /// A shared board: eight clients on two saturated channels, two of them slow.
+    Serve,
 }
 
 /// What `cargo xtask bench` takes.
@@ -68,7 +80,7 @@ enum Subject {
 pub struct Args {
     /// What to measure; everything if not given.
     subject: Vec<Subject>,
-    /// How long the live view is watched.
+    /// How long the live view is watched, and how long the board is shared.
     #[arg(long, value_name = "N", default_value_t = 60)]
     seconds: u32,
     /// Of what is measured on the emulated board, only the rows whose names contain this.
@@ -110,6 +122,7 @@ pub fn run(args: &Args) -> Result<()> {
         match subject {
             Subject::Wire => wire::run()?,
             Subject::Formats => formats::run()?,
+            Subject::Columns => columns::run()?,
             Subject::Memory => memory::run()?,
             Subject::Signals => signals::run()?,
             Subject::Emulated => emulated::run(&extent)?,
@@ -118,8 +131,15 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Graph => graph::run()?,
             Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,
+            #[cfg(unix)]
+            Subject::Serve => serve::run(args.seconds)?,
+            #[cfg(not(unix))]
+            Subject::Serve => {
+                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+            }
         }
     }
     Ok(())

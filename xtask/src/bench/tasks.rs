@@ -1,6 +1,7 @@
 //! Where the processor's time goes while the emulated board does something: by interrupt, and by function.
 
 use anyhow::{Context, Result};
+use cantap_emu::probe::Task;
 use cantap_emu::profile::Table;
 use cantap_emu::timing::Bound;
 use cantap_sim::rig::Rig;
@@ -31,9 +32,12 @@ pub fn print(
         functions = Table { rows: &rows, name_of, span, least_percent: LEAST_PERCENT }.to_string();
     }
     let [best, worst] = &shares[..] else { unreachable!("two bounds") };
-    for (task, entries, best) in best {
-        let worst = worst.iter().find(|(name, ..)| name == task).map_or(0.0, |(_, _, share)| *share);
-        println!("  {task:<24} {best:>6.2} / {worst:>5.2}  ({entries} times)");
+    for Task { name, entries, percent, longest_us } in best {
+        let slow = worst.iter().find(|task| task.name == *name);
+        let [slow_percent, slow_longest] = slow.map_or([0.0; 2], |task| [task.percent, task.longest_us]);
+        println!(
+            "  {name:<24} {percent:>6.2} / {slow_percent:>5.2}  ({entries} times, at most {longest_us:.1} / {slow_longest:.1} us)"
+        );
     }
     println!("at worst by function: its own, and waiting for instructions, data in flash, buses, branches");
     print!("{functions}");

@@ -30,7 +30,7 @@ impl Summary {
     pub fn event(&mut self, event: &Event) {
         let (all, faults) = self.events.entry(event.protocol).or_default();
         *all += 1;
-        *faults += u64::from(is_fault(event));
+        *faults += u64::from(event.is_fault());
     }
 
     pub fn object(&self) -> serde_json::Value {
@@ -64,9 +64,4 @@ impl Summary {
             eprintln!("cantap: {lost} are missing in the trace, at {} places", self.gaps);
         }
     }
-}
-
-/// Whether something went wrong: a refusal, a request without a response, a transfer that broke, frames that are missing.
-pub fn is_fault(event: &Event) -> bool {
-    event.trouble.is_some() || event.frames_lost || event.kind == "refusal"
 }

@@ -140,7 +140,12 @@ fn kind(kind: ValueKind) -> &'static str {
 /// A whole database.
 pub fn database(database: &Database) -> Value {
     let messages: Vec<_> = database.messages.iter().map(as_json).collect();
-    json!({ "file": database.file, "warnings": database.warnings.len(), "messages": messages })
+    json!({
+        "file": database.file,
+        "buses": database.buses,
+        "warnings": database.warnings.len(),
+        "messages": messages,
+    })
 }
 
 fn as_json(message: &Message) -> Value {

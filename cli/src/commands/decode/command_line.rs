@@ -11,6 +11,7 @@ use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::input::ReadArgs;
 use crate::live::LiveArgs;
+use crate::protocols::ProtocolArgs;
 
 /// The command line.
 #[derive(clap::Args)]
@@ -20,10 +21,12 @@ use crate::live::LiveArgs;
     candump -L can0 | cantap decode --db car.dbc - --json\n  \
     cantap decode --db car.dbc trace.log --resample 100ms -o drive.csv\n  \
     cantap decode --db car.dbc trace.log -o drive.parquet\n  \
-    cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n\n\
+    cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
+    cantap decode workshop.log --protocols --csv\n\n\
 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
     identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
 With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
+With --protocols, what was said has also protocol, from and to.\n\
 The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]
 pub struct Args {
     #[command(flatten)]
@@ -37,6 +40,12 @@ pub struct Args {
     /// repeated.
     #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
     pub signals: Vec<String>,
+    /// Also what frames say together, by the protocols that each channel shows: its fields as signals, named uds.sid, j1939.pgn
+    /// and so on (docs/protocols.md). Not in tables with a column per signal, and not in Parquet.
+    #[arg(long, conflicts_with_all = ["wide", "resample"])]
+    pub protocols: bool,
+    #[command(flatten)]
+    pub protocol: ProtocolArgs,
     /// Write to this file instead of standard output. Its name may say the form: .csv, .json, or .parquet, a table for DuckDB,
     /// Polars, pandas and Spark with a row per value, and one per loss or bus error.
     #[arg(short, long, value_name = "FILE")]

@@ -6,6 +6,7 @@ use std::path::Path;
 
 use anyhow::Context;
 use cantap::{TraceEvent, TraceRecord};
+use cantap_protocols::Event;
 use cantap_signals::Decoder;
 
 #[cfg(feature = "parquet")]
@@ -13,7 +14,7 @@ use super::columns::{Long, PerMessage, WideFile};
 use super::command_line::Args;
 use super::decoded::Decoded;
 use super::wide::{Csv, Wide};
-use super::{csv, json, text};
+use super::{csv, json, said, text};
 use crate::beside::Beside;
 use crate::trace_output::failed;
 use crate::wrong::wrong;
@@ -48,6 +49,12 @@ impl Form {
         if matches!(form, Self::Text | Self::Json) && (args.wide || args.resample.is_some()) {
             return Err(wrong(
                 "--wide and --resample make tables; add --csv, or -o with a name that ends in .csv or .parquet",
+            ));
+        }
+        #[cfg(feature = "parquet")]
+        if form == Self::Parquet && args.protocols {
+            return Err(wrong(
+                "a Parquet file has no place for what protocols say; write it to a file that ends in .csv or .json",
             ));
         }
         Ok(form)
@@ -154,6 +161,18 @@ impl<'a> Output<'a> {
             To::Long(long) => long.push(self.decoder, decoded)?,
             #[cfg(feature = "parquet")]
             To::PerMessage(files) => files.push(decoded)?,
+        }
+        Ok(())
+    }
+
+    /// Takes what frames said together.
+    pub fn push_said(&mut self, event: &Event) -> anyhow::Result<()> {
+        match &mut self.to {
+            To::Lines { lines, json: true, details } => said::json(&mut lines.out, event, *details)?,
+            To::Lines { lines, .. } => said::text(&mut lines.out, event)?,
+            To::Csv(lines) => said::csv(&mut lines.out, event)?,
+            // Refused on the command line.
+            _ => {}
         }
         Ok(())
     }

@@ -7,7 +7,6 @@ use std::process::ExitCode;
 use cantap_serve::Role;
 use cantap_serve::tls::{Files, Keys, Server};
 
-use super::Args;
 use crate::server::role;
 use crate::wrong::wrong;
 
@@ -75,9 +74,8 @@ fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::
     Ok(ExitCode::SUCCESS)
 }
 
-/// The server's side, as the command line names it.
-pub fn server(args: &Args) -> anyhow::Result<Option<Server>> {
-    let (Some((certificate, key)), Some(authority)) = (&args.tls, &args.clients) else { return Ok(None) };
-    let files = Files { certificate: certificate.clone(), key: key.clone(), authority: authority.clone() };
-    Ok(Some(Server::new(&files)?))
+/// The server's side: its certificate and key, and the authority of its clients.
+pub fn server((certificate, key): &(PathBuf, PathBuf), authority: &Path) -> anyhow::Result<Server> {
+    let files = Files { certificate: certificate.clone(), key: key.clone(), authority: authority.to_owned() };
+    Ok(Server::new(&files)?)
 }

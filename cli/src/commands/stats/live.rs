@@ -11,6 +11,7 @@ use crate::args::Channels;
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::live::{LiveRecords, unasked};
+use crate::protocols::Known;
 use crate::stderr;
 
 /// How long after its end a window is closed, so that what is still on the way gets into it.
@@ -37,6 +38,7 @@ pub(super) fn run(
     live: &mut LiveRecords,
     statistics: &mut Statistics,
     windows: &mut Option<Windows>,
+    known: &mut Option<Known>,
 ) -> anyhow::Result<()> {
     let mut show = Lines::new(shown);
     let mut keep = |window: &Window| {
@@ -45,7 +47,7 @@ pub(super) fn run(
             windows.push(window);
         }
     };
-    let ended = listen(live, statistics, &mut keep);
+    let ended = listen(live, statistics, known, &mut keep);
     statistics.finish_with(&mut keep);
     ended
 }
@@ -53,12 +55,16 @@ pub(super) fn run(
 fn listen(
     live: &mut LiveRecords,
     statistics: &mut Statistics,
+    known: &mut Option<Known>,
     keep: &mut impl FnMut(&Window),
 ) -> anyhow::Result<()> {
     let mut batch = Vec::new();
     while live.next_batch(&mut batch)? {
         for record in &batch {
             statistics.push_with(record, &mut *keep);
+        }
+        if let Some(known) = known {
+            known.take(&batch, true);
         }
         statistics.advance_with(now_ns().saturating_sub(LATENESS_NS), &mut *keep);
     }

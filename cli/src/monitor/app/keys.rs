@@ -52,7 +52,7 @@ impl App {
         match key.code {
             KeyCode::Char('q') => return Flow::Quit,
             KeyCode::Char('h' | '?') | KeyCode::F(1) => (self.help, self.help_first) = (true, 0),
-            KeyCode::Char(digit @ '1'..='7') => self.show(View::ALL[digit as usize - '1' as usize]),
+            KeyCode::Char(digit @ '1'..='8') => self.show(View::ALL[digit as usize - '1' as usize]),
             KeyCode::Tab => self.show(View::ALL[(self.view as usize + 1) % View::ALL.len()]),
             KeyCode::BackTab => {
                 self.show(View::ALL[(self.view as usize + View::ALL.len() - 1) % View::ALL.len()]);
@@ -135,8 +135,8 @@ impl App {
             (View::Signals, KeyCode::Char('s')) => self.signals.sort = self.signals.sort.next(),
             (View::Signals, KeyCode::Char('S')) => self.signals.reverse = !self.signals.reverse,
             (View::Signals, KeyCode::Char('g')) => self.signals.grouped = !self.signals.grouped,
-            (View::Signals, KeyCode::Char('F')) => {
-                let text = self.signals.filter.text().to_owned();
+            (View::Signals | View::Fixed, KeyCode::Char('F')) => {
+                let text = self.signal_filter().text().to_owned();
                 self.ask(PromptKind::Signals, &text);
             }
             (View::Graph, code) => self.graph.key(code),
@@ -266,7 +266,7 @@ impl App {
                     self.cursor = Some(place);
                 }
             }
-            View::Graph | View::Statistics | View::Record => {}
+            View::Graph | View::Statistics | View::Record | View::Nodes => {}
         }
     }
 }

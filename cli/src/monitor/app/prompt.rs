@@ -12,7 +12,7 @@ use super::completion::{Completed, complete};
 use super::entry::parse_entry;
 use super::line::{Prompt, PromptKind};
 use super::signals::SignalFilter;
-use super::state::{App, Direction};
+use super::state::{App, Direction, View};
 
 impl App {
     pub(super) fn prompt_key(&mut self, code: KeyCode, model: &mut Model) {
@@ -51,7 +51,7 @@ impl App {
             {
                 Ok(())
             }
-            PromptKind::Signals => SignalFilter::new(text).map(|filter| self.signals.filter = filter),
+            PromptKind::Signals => SignalFilter::new(text).map(|filter| *self.signal_filter() = filter),
             PromptKind::Time => self.seek_to(text, model),
             PromptKind::Open => self.open_file(text, model),
             PromptKind::Device if Self::is_trace(text) => self.open_beside(Path::new(text)),
@@ -79,6 +79,11 @@ impl App {
         }
         self.order(Order::Record(text.to_owned()));
         Ok(())
+    }
+
+    /// Which signals this page shows, or has rows of.
+    pub(super) fn signal_filter(&mut self) -> &mut SignalFilter {
+        if self.view == View::Fixed { &mut self.row_filter } else { &mut self.signals.filter }
     }
 
     fn set_filters(&mut self, text: &str, model: &mut Model) -> Result<(), String> {

@@ -15,7 +15,7 @@ use super::column::Column;
 use super::entry::SendEntry;
 use super::graph::Graph;
 use super::line::{Line, Prompt, PromptKind};
-use super::signals::SignalsPage;
+use super::signals::{SignalFilter, SignalsPage};
 use super::wish::Wish;
 use crate::databases::Databases;
 
@@ -37,12 +37,22 @@ pub enum View {
     Send,
     /// Recording.
     Record,
+    /// Nodes, transfers, and what was said.
+    Nodes,
 }
 
 impl View {
     /// In the order of their keys.
-    pub const ALL: [View; 7] =
-        [View::Trace, View::Fixed, View::Signals, View::Graph, View::Statistics, View::Send, View::Record];
+    pub const ALL: [View; 8] = [
+        View::Trace,
+        View::Fixed,
+        View::Signals,
+        View::Graph,
+        View::Statistics,
+        View::Send,
+        View::Record,
+        View::Nodes,
+    ];
 
     /// What its tab says.
     pub const fn title(self) -> &'static str {
@@ -54,6 +64,7 @@ impl View {
             Self::Statistics => "Statistics",
             Self::Send => "Send",
             Self::Record => "Record",
+            Self::Nodes => "Nodes",
         }
     }
 
@@ -118,6 +129,8 @@ pub struct App {
     pub sort_columns: Vec<(Range<u16>, Column)>,
     /// Identifiers whose signals stand below their row.
     pub opened: HashSet<(u8, Id)>,
+    /// The fixed view shows identifiers with a signal that is so.
+    pub row_filter: SignalFilter,
     /// The signals of the trace's selected record are shown.
     pub record_opened: bool,
     /// How the signals page is.
@@ -211,6 +224,7 @@ impl App {
             sort_columns: Vec::new(),
             opened: HashSet::new(),
             record_opened: false,
+            row_filter: SignalFilter::default(),
             signals: SignalsPage::default(),
             selected: 0,
             fixed_order: Vec::new(),

@@ -6,6 +6,7 @@ pub mod history;
 mod kept;
 pub mod series;
 pub mod signals;
+mod talk;
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -24,6 +25,7 @@ pub use fixed::{FixedTable, Row};
 pub use history::History;
 pub use series::{Column, Point, Series};
 pub use signals::{Decoded, SignalRow, SignalTable};
+pub use talk::{Talk, Talked};
 
 /// Windows of the load's history.
 pub const LOAD_WINDOW: Duration = Duration::from_millis(250);
@@ -108,6 +110,8 @@ pub struct Seen {
     pub statistics: Statistics,
     /// The load of the last windows, per channel, the newest last.
     pub loads: Vec<(u8, VecDeque<Window>)>,
+    /// What the frames mean.
+    pub talked: Talked,
     /// The devices, if the source is some.
     pub devices: Vec<DeviceFigures>,
     /// Records taken.
@@ -152,6 +156,7 @@ pub struct Model {
     pub recording: Option<Recording>,
     /// The last thing that the user should know.
     pub notice: String,
+    talk: Talk,
     options: Options,
 }
 
@@ -164,6 +169,7 @@ impl Model {
             signals: SignalTable::new(decoder, history_bytes),
             statistics: Statistics::new(options.clone())?,
             loads: Vec::new(),
+            talked: Talked::default(),
             devices: Vec::new(),
             taken: 0,
             now_ns: 0,
@@ -181,6 +187,7 @@ impl Model {
             unread: None,
             recording: None,
             notice: String::new(),
+            talk: Talk::default(),
             options,
         })
     }
@@ -202,7 +209,8 @@ impl Model {
         if let (None, Some(first)) = (self.first_ns, records.first()) {
             self.first_ns = Some(first.time_ns);
         }
-        let Seen { table, signals, statistics, loads, taken, now_ns, .. } = &mut self.seen;
+        let Seen { table, signals, statistics, loads, taken, now_ns, talked, .. } = &mut self.seen;
+        self.talk.take(records, talked);
         *now_ns = records.last().map_or(*now_ns, |last| last.time_ns);
         for record in records {
             statistics.push_with(record, |window| keep_load(loads, window));
@@ -232,6 +240,7 @@ impl Model {
         self.history.clear();
         self.seen.table = FixedTable::default();
         self.seen.signals.clear();
+        (self.talk, self.seen.talked) = (Talk::default(), Talked::default());
         self.seen.taken = 0;
         self.first_ns = None;
         self.begin_statistics();

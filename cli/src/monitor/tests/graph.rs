@@ -5,29 +5,13 @@ use cantap_analysis::stats::Options;
 use ratatui::crossterm::event::{KeyCode, KeyEvent, KeyModifiers, MouseButton, MouseEvent, MouseEventKind};
 
 use super::super::app::{App, View};
-use super::super::model::Model;
-use super::{app, database, frame, press, screen_text};
+use super::super::model::{Model, Series};
+use super::{SIGNALS, app, database, frame, press, screen_text};
 
 const MS: i64 = 1_000_000;
 const S: i64 = 1000 * MS;
 /// 12:00:00 of a day.
 const NOON: i64 = (20_000 * 86_400 + 43_200) * S;
-
-const SIGNALS: &str = r#"
-    version = 1
-    [[message]]
-    name = "Engine"
-    id = 0x123
-    length = 2
-    [[message.signal]]
-    name = "Speed"
-    at = "D1"
-    unit = "rpm"
-    [[message.signal]]
-    name = "Brake"
-    at = "D2"
-    digital = { low = 0, high = 1 }
-"#;
 
 fn model(history_bytes: usize) -> Model {
     let mut model = Model::new(database(SIGNALS), Options::default(), history_bytes).unwrap();
@@ -36,7 +20,7 @@ fn model(history_bytes: usize) -> Model {
 }
 
 fn sample(at_ns: i64, speed: u8, brake: u8) -> TraceRecord {
-    TraceRecord { time_ns: NOON + at_ns, channel: 1, event: frame(&format!("123#{speed:02X}{brake:02X}")) }
+    TraceRecord { time_ns: NOON + at_ns, channel: 1, event: frame(&format!("100#{speed:02X}00{brake:02X}")) }
 }
 
 fn keys(app: &mut App, model: &mut Model, codes: &[KeyCode]) {
@@ -163,7 +147,7 @@ fn a_signal_that_is_chosen_late_has_its_past_and_what_fell_out_is_told() {
     );
     let (mut app, _orders) = app(View::Signals);
     screen_text(&mut app, &model, (100, 24)).unwrap();
-    keys(&mut app, &mut model, &[KeyCode::Down, KeyCode::Enter]);
+    keys(&mut app, &mut model, &[KeyCode::Down, KeyCode::Down, KeyCode::Enter]);
     press(&mut app, &mut model, "4");
     let screen = screen_text(&mut app, &model, (100, 24)).unwrap();
     let lane = screen.lines().find(|line| line.contains('▔')).unwrap();
@@ -199,4 +183,53 @@ fn the_window_pans_back_and_follows_again() {
     assert_eq!(app.graph.end_ns, None);
     keys(&mut app, &mut model, &[KeyCode::Left, KeyCode::End]);
     assert_eq!(app.graph.end_ns, None);
+}
+
+/// What `cargo xtask bench graph` prints: how long a redraw takes with five million values in the window, and where the window is a
+/// hundredth of them. A second of memory and decoding is no test for every day.
+#[test]
+#[ignore = "a measurement: cargo xtask bench graph"]
+fn redraws_of_five_million_values() {
+    use std::time::Instant;
+
+    const VALUES: usize = 5_000_000;
+    let mut model = model(512_000_000);
+    let begun = Instant::now();
+    let mut batch = Vec::new();
+    for n in 0..VALUES {
+        batch.push(sample(n as i64 * 50_000, (n * 37 % 251) as u8, 0));
+        if batch.len() == 4096 || n + 1 == VALUES {
+            model.take(&batch);
+            batch.clear();
+        }
+    }
+    let taken = begun.elapsed().as_secs_f64();
+    let kept: usize =
+        model.seen.signals.rows().iter().filter_map(|row| row.series.as_ref()).map(Series::len).sum();
+    assert_eq!(kept, VALUES);
+    let (mut app, _orders) = app(View::Graph);
+    for (window, key) in [("all of them", "a"), ("a hundredth", "")] {
+        press(&mut app, &mut model, key);
+        if key.is_empty() {
+            app.graph.span_ns /= 100;
+        }
+        for size in [(80, 24), (160, 50), (300, 100)] {
+            screen_text(&mut app, &model, size).unwrap();
+            let mut times: Vec<f64> = (0..50)
+                .map(|_| {
+                    let begun = Instant::now();
+                    screen_text(&mut app, &model, size).unwrap();
+                    begun.elapsed().as_secs_f64() * 1e3
+                })
+                .collect();
+            times.sort_by(f64::total_cmp);
+            println!(
+                "{window:<12} {:>3} x {:<3} median {:.2} ms, most {:.2} ms",
+                size.0, size.1, times[25], times[49]
+            );
+            // Each redraw has 40 ms; this one must leave the others time.
+            assert!(times[25] < 20.0, "{times:?}");
+        }
+    }
+    println!("taking {VALUES} frames: {taken:.2} s");
 }

@@ -36,6 +36,34 @@ use crate::address::Address;
 /// A small screen and a wide one.
 const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];
 
+/// An engine whose frames may leave out the brake, and a door.
+const SIGNALS: &str = r#"
+    version = 1
+    [[message]]
+    name = "Engine"
+    id = 0x100
+    length = 3
+    [[message.signal]]
+    name = "Speed"
+    at = "D1"
+    unit = "rpm"
+    [[message.signal]]
+    name = "OilTemp"
+    at = "D2"
+    alarm = { max = 120 }
+    [[message.signal]]
+    name = "Brake"
+    at = "D3"
+    digital = { low = 0, high = 1 }
+    [[message]]
+    name = "Body"
+    id = 0x200
+    length = 1
+    [[message.signal]]
+    name = "Door"
+    at = "D1"
+"#;
+
 fn here() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("src/monitor/snapshots")
 }
@@ -216,6 +244,40 @@ fn the_send_page_is_as_agreed() {
 #[test]
 fn the_record_page_is_as_agreed() {
     check_page(View::Record);
+}
+
+/// The boat's nodes, and what they said.
+#[test]
+fn the_nodes_page_is_as_agreed() {
+    check_page(View::Nodes);
+}
+
+/// A transfer stands there until it is done, and a fault is seen.
+#[test]
+fn transfers_under_way_are_shown_until_they_end() {
+    let mut model = Model::new(database("version = 1"), Options::default(), 1_000_000).unwrap();
+    let at = |ms: i64, text: &str| TraceRecord { time_ns: ms * 1_000_000, channel: 1, event: frame(text) };
+    let talk = |from: i64| {
+        [
+            at(from, "7E0#0322F190"),
+            at(from + 1, "7E8#101462F190575657"),
+            at(from + 2, "7E0#300000"),
+            at(from + 3, "7E8#215A5A5A314B5A41"),
+        ]
+    };
+    let rest = |from: i64| [at(from + 4, "7E8#2257303030303031")];
+    model.take(&[&talk(0)[..], &rest(0), &talk(4000)].concat());
+    let (mut app, _orders) = app(View::Nodes);
+    let open = screen_text(&mut app, &model, (160, 24)).unwrap();
+    assert!(open.contains("Transfers under way 1") && open.contains("7E8 > 7E0  13 of 20 bytes"), "{open}");
+    model.take(&rest(4000));
+    let done = screen_text(&mut app, &model, (160, 24)).unwrap();
+    assert!(
+        done.contains("Transfers under way 0") && done.contains("7E8             2, WVWZZZ1KZAW000001"),
+        "{done}"
+    );
+    press(&mut app, &mut model, "c");
+    assert!(screen_text(&mut app, &model, (160, 24)).unwrap().contains("Nobody was understood so far"));
 }
 
 #[test]

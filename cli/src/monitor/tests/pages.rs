@@ -10,30 +10,7 @@ use super::super::app::{App, SignalColumn, View, Wish};
 use super::super::model::{Model, Playing, SourceState};
 use super::super::order::Order;
 use super::super::screen;
-use super::{app, database, frame, model, press, screen_text};
-
-const SIGNALS: &str = r#"
-    version = 1
-    [[message]]
-    name = "Engine"
-    id = 0x100
-    length = 2
-    [[message.signal]]
-    name = "Speed"
-    at = "D1"
-    unit = "rpm"
-    [[message.signal]]
-    name = "OilTemp"
-    at = "D2"
-    alarm = { max = 120 }
-    [[message]]
-    name = "Body"
-    id = 0x200
-    length = 1
-    [[message.signal]]
-    name = "Door"
-    at = "D1"
-"#;
+use super::{SIGNALS, app, database, frame, model, press, screen_text};
 
 fn car() -> Model {
     let mut model = Model::new(database(SIGNALS), Options::default(), 1_000_000).unwrap();
@@ -113,6 +90,32 @@ fn signals_are_searched_grouped_sorted_and_narrowed() {
     press(&mut app, &mut model, "F and\n");
     let text = screen_text(&mut app, &model, (110, 24)).unwrap();
     assert!(text.contains("engine and > 50"), "{text}");
+}
+
+#[test]
+fn the_fixed_page_is_narrowed_by_signals_with_a_condition_of_its_own() {
+    let mut model = car();
+    let (mut app, _orders) = app(View::Fixed);
+    let ids = |app: &mut App, model: &Model| -> Vec<String> {
+        screen_text(app, model, (110, 24)).unwrap();
+        app.fixed_order.iter().map(|(_, id)| id.to_string()).collect()
+    };
+    assert_eq!(ids(&mut app, &model), ["100", "200"]);
+    press(&mut app, &mut model, "Foiltemp > 100\n");
+    assert_eq!(ids(&mut app, &model), ["100"]);
+    let text = screen_text(&mut app, &model, (110, 24)).unwrap();
+    assert!(text.contains("(F oiltemp > 100: 1 hidden)"), "{text}");
+    // The page of signals shows all; what is typed there is another condition.
+    press(&mut app, &mut model, "3");
+    assert!(screen_text(&mut app, &model, (110, 24)).unwrap().contains("Body.Door"));
+    press(&mut app, &mut model, "2F");
+    for _ in 0..20 {
+        app.key(KeyEvent::from(KeyCode::Backspace), &mut model);
+    }
+    press(&mut app, &mut model, "alarm\n");
+    assert_eq!(ids(&mut app, &model), ["100"]);
+    model.take(&[TraceRecord { time_ns: 43_203_000_000_000, channel: 1, event: frame("100#1464") }]);
+    assert_eq!(ids(&mut app, &model), [""; 0]);
 }
 
 #[test]
@@ -281,12 +284,12 @@ fn what_is_sent_is_completed_from_the_database() {
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
     assert_eq!(app.prompt.as_ref().unwrap().line.text(), "Engine:");
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
-    assert_eq!(app.message, "OilTemp  Speed");
+    assert_eq!(app.message, "Brake  OilTemp  Speed");
     press(&mut app, &mut model, "s");
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
-    press(&mut app, &mut model, "30,");
+    press(&mut app, &mut model, "30,o");
     app.key(KeyEvent::from(KeyCode::Tab), &mut model);
     press(&mut app, &mut model, "5 100ms\n");
     assert_eq!(app.send[0].text, "Engine:Speed=30,OilTemp=5 100ms");
-    assert_eq!(app.send[0].frame.to_string(), "100#1E05");
+    assert_eq!(app.send[0].frame.to_string(), "100#1E0500");
 }

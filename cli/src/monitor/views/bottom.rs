@@ -145,6 +145,7 @@ fn keys(app: &App, model: &Model, width: usize) -> String {
         View::Statistics => "b bit rate  A find it  D device  m mode  R recover",
         View::Send => "a add  e edit  d delete  Enter once  Space on/off  m mode",
         View::Record => "r start or stop",
+        View::Nodes => "↑↓ scroll",
     };
     let playback = match model.source {
         SourceState::Playing(_) => {

@@ -1,5 +1,8 @@
 //! One row per identifier, with what changes highlighted.
 
+use std::collections::HashSet;
+
+use cantap_signals::MessageRef;
 use ratatui::Frame;
 use ratatui::layout::Rect;
 use ratatui::style::Style;
@@ -7,7 +10,7 @@ use ratatui::text::{Line, Span};
 
 use super::super::app::{App, Column};
 use super::super::event_text::printable;
-use super::super::model::{Decoded, Model, Row, Seen};
+use super::super::model::{Decoded, Model, Row, Seen, SignalRow};
 use super::super::theme::Theme;
 use super::list::list;
 use super::signals::{alarm, in_line};
@@ -76,7 +79,12 @@ fn heading(app: &mut App, seen: &Seen, ascii: bool, hidden: usize) -> Line<'stat
             app.sort_columns.push((start as u16..text.chars().count() as u16, column));
         }
     }
+    let condition = match app.row_filter.text() {
+        "" => String::new(),
+        condition => format!("F {condition}: "),
+    };
     match (hidden, seen.table.unlisted) {
+        (hidden, 0) if !condition.is_empty() => Line::from(format!("{text}({condition}{hidden} hidden)")),
         (0, 0) => Line::from(text.trim_end().to_owned()),
         (hidden, 0) => Line::from(format!("{text}({hidden} hidden)")),
         (_, unlisted) => Line::from(format!("{text}({unlisted} frames of further IDs)")),
@@ -104,7 +112,17 @@ fn signal_line(signal: &Decoded, theme: Theme) -> Line<'static> {
 }
 
 fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
-    let shown = |row: &&Row| !row.hidden && model.history.accepts(&row.last());
+    let chosen = chosen_messages(app, seen);
+    let decoder = seen.signals.decoder();
+    let has_signal = |row: &Row| {
+        let message = decoder.find(row.channel, row.frame.id());
+        message.is_some_and(|message| chosen.contains(&(row.channel, message)))
+    };
+    let shown = |row: &&Row| {
+        !row.hidden
+            && model.history.accepts(&row.last())
+            && (app.row_filter.text().is_empty() || has_signal(row))
+    };
     let mut rows: Vec<_> = seen.table.rows().iter().filter(shown).collect();
     let id = |row: &&Row| (row.frame.id().is_extended(), row.frame.id().raw(), row.channel);
     rows.sort_by_key(id);
@@ -127,6 +145,18 @@ fn sorted<'a>(app: &App, model: &Model, seen: &'a Seen) -> Vec<&'a Row> {
         rows.sort_by_key(|row| row.channel);
     }
     rows
+}
+
+/// The messages, each with its channel, with a signal that is as the page's condition says.
+fn chosen_messages(app: &App, seen: &Seen) -> HashSet<(u8, MessageRef)> {
+    let filter = &app.row_filter;
+    let is_chosen = |row: &&SignalRow| {
+        filter.accepts(&seen.signals.full_name(row), row.value, seen.signals.alarm(row).is_some())
+    };
+    if filter.text().is_empty() {
+        return HashSet::new();
+    }
+    seen.signals.rows().iter().filter(is_chosen).map(|row| (row.channel, row.message)).collect()
 }
 
 fn name<'a>(row: &Row, seen: &'a Seen) -> &'a str {

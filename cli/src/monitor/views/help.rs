@@ -10,7 +10,7 @@ use super::super::theme::Theme;
 
 /// Every key; `tests/help.rs` holds them to what the keys do.
 pub const KEYS: &[(&str, &str)] = &[
-    ("1 … 7, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
+    ("1 … 8, Tab", "pages: trace, fixed, signals, graph, statistics, send …"),
     ("q, Ctrl-C Ctrl-Z", "leave; give the shell back for a while"),
     ("h ? F1", "this"),
     ("Space", "stop the display or the file, go on; send: entry on or off"),
@@ -23,7 +23,7 @@ pub const KEYS: &[(&str, &str)] = &[
     ("#  *  H", "fixed: hide what changes anyway, show it again, bits' heat"),
     ("x  u  o", "fixed: hide the row, show all, colour the row"),
     ("Enter", "trace, fixed: signals; signals: into the graph; send: once"),
-    ("F", "signals: show only some, by name, value, alarm"),
+    ("F", "signals, fixed: show only some, by name, value, alarm"),
     ("+ -  ↑ ↓ wheel", "graph: zoom, around the cursor or the mouse"),
     ("← → PgUp PgDn", "graph: move the cursor or pan; Home is oldest, End follows"),
     ("x  a  s  Esc", "graph: cursors, show all, steps or lines, no cursors"),

@@ -5,6 +5,7 @@ pub mod fixed;
 pub mod graph;
 pub mod help;
 mod list;
+pub mod nodes;
 pub mod record;
 pub mod send;
 pub mod signals;
@@ -54,6 +55,7 @@ pub fn draw(frame: &mut Frame<'_>, app: &mut App, model: &Model) {
         View::Statistics => statistics::draw(frame, body, app, model, seen),
         View::Send => send::draw(frame, body, app, seen),
         View::Record => record::draw(frame, body, app, model),
+        View::Nodes => nodes::draw(frame, body, app, model, seen),
     }
     app.frozen = frozen;
     bottom::draw(frame, body, bottom, app, model);

@@ -2,7 +2,7 @@
 
 use cantap_wire::{Frame, Id};
 
-use super::super::codec::Encode;
+use super::super::codec::{Encode, HeadLine};
 use super::super::event_text::EventText;
 use super::super::issue::Fault;
 use super::super::left_out::LeftOut;
@@ -83,17 +83,11 @@ pub(super) fn row(line: &[u8]) -> Result<TraceRecord, Fault> {
 }
 
 /// Writes the dialect.
-#[derive(Default)]
-pub(crate) struct Encoder {
-    started: bool,
-}
+pub(crate) struct Encoder(HeadLine);
 
-impl Encoder {
-    fn start(&mut self, out: &mut Vec<u8>) {
-        if !std::mem::replace(&mut self.started, true) {
-            out.extend_from_slice(HEAD.as_bytes());
-            out.push(b'\n');
-        }
+impl Default for Encoder {
+    fn default() -> Self {
+        Self(HeadLine::of(HEAD))
     }
 }
 
@@ -103,7 +97,7 @@ impl Encode for Encoder {
     }
 
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
         push_time(out, record.time_ns);
         out.push(b',');
         text::push_decimal(out, u64::from(record.channel));
@@ -131,6 +125,6 @@ impl Encode for Encoder {
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
     }
 }

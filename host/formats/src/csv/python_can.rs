@@ -5,7 +5,7 @@ use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use cantap_wire::{Frame, Id};
 
-use super::super::codec::Encode;
+use super::super::codec::{Encode, HeadLine};
 use super::super::error_frames::ErrorFrames;
 use super::super::found::Row;
 use super::super::issue::Fault;
@@ -109,23 +109,17 @@ pub(crate) fn time_ns(time: &[u8]) -> Option<i64> {
 }
 
 /// Writes the dialect.
-#[derive(Default)]
-pub(crate) struct Encoder {
-    started: bool,
-}
+pub(crate) struct Encoder(HeadLine);
 
-impl Encoder {
-    fn start(&mut self, out: &mut Vec<u8>) {
-        if !std::mem::replace(&mut self.started, true) {
-            out.extend_from_slice(HEAD.as_bytes());
-            out.push(b'\n');
-        }
+impl Default for Encoder {
+    fn default() -> Self {
+        Self(HeadLine::of(HEAD))
     }
 }
 
 impl Encode for Encoder {
     fn record(&mut self, record: &TraceRecord, out: &mut Vec<u8>, left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
         if record.channel != 1 {
             left_out.note("channels other than 1, which python-can's CSV has no column for");
         }
@@ -170,6 +164,6 @@ impl Encode for Encoder {
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
-        self.start(out);
+        self.0.write(out);
     }
 }

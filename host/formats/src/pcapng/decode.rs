@@ -10,8 +10,9 @@ use super::super::issue::{Fault, Place};
 use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, IF_NAME,
-    IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, OBSOLETE_PACKET, OUTBOUND, SECTION_HEADER, SIMPLE_PACKET,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS,
+    IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE, OBSOLETE_PACKET, OUTBOUND, SECTION_HEADER,
+    SIMPLE_PACKET, STATISTICS,
 };
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
@@ -172,7 +173,10 @@ impl Decoder {
     /// Whether a whole, known block begins here.
     fn is_block(&self, bytes: &[u8]) -> bool {
         let fields = Fields { bytes, big_endian: self.big_endian };
-        let known = matches!(fields.u32(0), Some(SECTION_HEADER | INTERFACE_DESCRIPTION | ENHANCED_PACKET));
+        let known = matches!(
+            fields.u32(0),
+            Some(SECTION_HEADER | INTERFACE_DESCRIPTION | ENHANCED_PACKET | STATISTICS)
+        );
         let Some(len) = fields.u32(4).map(|len| len as usize).filter(|_| known) else { return false };
         (BLOCK_FRAME_BYTES..=4096).contains(&len) && fields.u32(len - 4) == Some(len as u32)
     }
@@ -269,11 +273,12 @@ impl Decoder {
         let Some(link) = interface.link else {
             return Ok(Found::LeftOut("packets that are not SocketCAN"));
         };
-        let (mut flags, mut dropped) = (0, 0);
+        let (mut flags, mut dropped, mut is_late) = (0, 0, false);
         for (code, value) in fields.options(options) {
             match code {
                 EPB_FLAGS => flags = value.u32(0).unwrap_or(0),
                 EPB_DROPCOUNT => dropped = value.u64(0).unwrap_or(0),
+                COMMENT => is_late |= value.bytes == LATE.as_bytes(),
                 _ => {}
             }
         }
@@ -283,7 +288,10 @@ impl Decoder {
         let count = u32::try_from(dropped).unwrap_or(u32::MAX);
         let lost = record(TraceEvent::Lost { stage: None, count, at_least: u64::from(count) < dropped });
         match self.packets.read(link, packet, direction(flags)) {
-            Ok(Packet::Events(event, second)) => {
+            Ok(Packet::Events(mut event, second)) => {
+                if let TraceEvent::Frame { late, .. } = &mut event {
+                    *late = is_late;
+                }
                 // Our own error frame for a loss has the same count, and says more.
                 if dropped > 0 && !matches!(event, TraceEvent::Lost { .. }) {
                     self.packets.errors.keep([event].into_iter().chain(second).map(record));

@@ -1,15 +1,20 @@
 //! Writing pcapng.
 
+use std::time::{Duration, Instant, SystemTime};
+
 use super::super::codec::Encode;
 use super::super::left_out::LeftOut;
 use super::super::socketcan_packet::{EXTENDED, FD_PACKET_BYTES, LINK_TYPE, PACKET_BYTES, REMOTE};
+use super::super::writer::{ChannelInfo, WriteOptions};
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_TSRESOL,
-    INTERFACE_DESCRIPTION, OUTBOUND, SECTION_HEADER, SHB_USERAPPL,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS,
+    IF_DESCRIPTION, IF_NAME, IF_SPEED, IF_TSRESOL, INTERFACE_DESCRIPTION, ISB_IFDROP, ISB_IFRECV,
+    ISB_USRDELIV, LATE, OUTBOUND, SECTION_HEADER, SHB_USERAPPL, STATISTICS,
 };
 use cantap_trace::fd::FLAG_FDF;
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
+use cantap_wire::record::LossStage;
 
 /// Times are in nanoseconds: 10 to the power of minus this.
 const RESOLUTION: u8 = 9;
@@ -18,8 +23,26 @@ const RESOLUTION: u8 = 9;
 #[derive(Default)]
 pub(crate) struct Encoder {
     started: bool,
-    /// The channels that have an interface, in the order of the interfaces.
-    channels: Vec<u8>,
+    /// In the order of their descriptions in the file.
+    interfaces: Vec<Interface>,
+    /// What is known of channels beforehand.
+    known: Vec<ChannelInfo>,
+    /// For somebody who reads meanwhile.
+    statistics_every: Option<Duration>,
+    /// When the statistics were last written.
+    counted: Option<Instant>,
+    /// Of the last record.
+    latest_ns: Option<i64>,
+}
+
+/// A channel that has been described.
+struct Interface {
+    channel: u8,
+    /// Frames written, and frames lost before they could be.
+    delivered: u64,
+    lost: u64,
+    /// For the next packet.
+    remarks: Vec<String>,
 }
 
 /// Appends a block around what `body` appends, padded to 32 bits.
@@ -42,7 +65,21 @@ fn option(out: &mut Vec<u8>, code: u16, value: &[u8]) {
     out.resize(out.len() + value.len().wrapping_neg() % 4, 0);
 }
 
+/// A time, in two halves, as blocks have it.
+fn halves(time_ns: i64) -> [u32; 2] {
+    let time = time_ns.cast_unsigned();
+    [(time >> 32) as u32, time as u32]
+}
+
 impl Encoder {
+    pub(crate) fn new(options: &WriteOptions) -> Self {
+        Self {
+            known: options.channels.clone(),
+            statistics_every: options.statistics_every,
+            ..Self::default()
+        }
+    }
+
     fn start(&mut self, out: &mut Vec<u8>) {
         self.started = true;
         block(out, SECTION_HEADER, |out| {
@@ -53,24 +90,87 @@ impl Encoder {
             option(out, SHB_USERAPPL, b"cantap");
             option(out, END, &[]);
         });
+        for channel in self.known.iter().map(|known| known.channel).collect::<Vec<_>>() {
+            self.interface(channel, out);
+        }
     }
 
     /// The number of a channel's interface, described before its first packet.
     #[inline]
-    fn interface(&mut self, channel: u8, out: &mut Vec<u8>) -> u32 {
-        if let Some(at) = self.channels.iter().position(|known| *known == channel) {
-            return at as u32;
+    fn interface(&mut self, channel: u8, out: &mut Vec<u8>) -> usize {
+        if let Some(at) = self.interfaces.iter().position(|interface| interface.channel == channel) {
+            return at;
         }
-        self.channels.push(channel);
+        self.describe(channel, out);
+        self.interfaces.push(Interface { channel, delivered: 0, lost: 0, remarks: Vec::new() });
+        self.interfaces.len() - 1
+    }
+
+    fn describe(&self, channel: u8, out: &mut Vec<u8>) {
+        let known = self.known.iter().find(|known| known.channel == channel);
         block(out, INTERFACE_DESCRIPTION, |out| {
             out.extend_from_slice(&LINK_TYPE.to_le_bytes());
             // Reserved, and no limit to a packet's length.
             out.extend_from_slice(&[0; 6]);
             option(out, IF_NAME, cantap_trace::Interface(channel).to_string().as_bytes());
+            if let Some(known) = known {
+                option(out, IF_DESCRIPTION, cut(&known.description).as_bytes());
+            }
+            if let Some(bitrate_bps) = known.and_then(|known| known.bitrate_bps) {
+                option(out, IF_SPEED, &u64::from(bitrate_bps).to_le_bytes());
+            }
             option(out, IF_TSRESOL, &[RESOLUTION]);
             option(out, END, &[]);
         });
-        self.channels.len() as u32 - 1
+    }
+
+    /// What each channel had and lost until now. Wireshark adds up nothing: the last block of an interface counts.
+    fn statistics(&mut self, time_ns: i64, out: &mut Vec<u8>) {
+        self.counted = Some(Instant::now());
+        for (number, Interface { delivered, lost, .. }) in (0_u32..).zip(&self.interfaces) {
+            block(out, STATISTICS, |out| {
+                let [high, low] = halves(time_ns);
+                for field in [number, high, low] {
+                    out.extend_from_slice(&field.to_le_bytes());
+                }
+                for (code, count) in
+                    [(ISB_IFRECV, delivered + lost), (ISB_IFDROP, *lost), (ISB_USRDELIV, *delivered)]
+                {
+                    option(out, code, &count.to_le_bytes());
+                }
+                option(out, END, &[]);
+            });
+        }
+    }
+}
+
+/// As much of a text as an option surely holds.
+fn cut(text: &str) -> &str {
+    const MOST: usize = 1024;
+    let end = (0..=text.len().min(MOST)).rev().find(|end| text.is_char_boundary(*end));
+    &text[..end.unwrap_or(0)]
+}
+
+/// Now, by this computer's clock.
+fn now_ns() -> i64 {
+    let since = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    i64::try_from(since.as_nanos()).unwrap_or(i64::MAX)
+}
+
+/// What a loss is to whoever reads packets.
+fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
+    let place = match stage {
+        Some(LossStage::Controller) => " in the CAN controller",
+        Some(LossStage::Queue) => " in the device's queue",
+        Some(LossStage::Link) => " between device and computer",
+        Some(LossStage::Host) => " in the computer",
+        None => "",
+    };
+    match (count, at_least) {
+        (0, true) => format!("frames were lost here{place}, nobody knows how many"),
+        (1, false) => format!("1 frame was lost here{place}"),
+        (count, true) => format!("at least {count} frames were lost here{place}"),
+        (count, false) => format!("{count} frames were lost here{place}"),
     }
 }
 
@@ -116,35 +216,79 @@ impl Encode for Encoder {
         if !self.started {
             self.start(out);
         }
-        let interface = self.interface(record.channel, out);
+        self.latest_ns = Some(record.time_ns);
+        let number = self.interface(record.channel, out);
+        let interface = &mut self.interfaces[number];
+        let remarks = std::mem::take(&mut interface.remarks);
+        let (mut comment, mut flags, mut dropped) = (None, None, None);
+        match record.event {
+            TraceEvent::Frame { direction, late, .. } => {
+                interface.delivered += 1;
+                comment = late.then(|| LATE.to_owned());
+                flags = (direction == Direction::Tx).then_some(OUTBOUND);
+            }
+            TraceEvent::Lost { stage, count, at_least } => {
+                interface.lost += u64::from(count);
+                comment = Some(loss(stage, count, at_least));
+                dropped = Some(u64::from(count));
+            }
+            _ => {}
+        }
         block(out, ENHANCED_PACKET, |out| {
-            let time = record.time_ns.cast_unsigned();
+            let [high, low] = halves(record.time_ns);
             let fd = record.frame().and_then(TraceFrame::fd);
             let len = if fd.is_some() { FD_PACKET_BYTES } else { PACKET_BYTES } as u32;
-            for field in [interface, (time >> 32) as u32, time as u32, len, len] {
+            for field in [number as u32, high, low, len, len] {
                 out.extend_from_slice(&field.to_le_bytes());
             }
             match fd {
                 Some(frame) => out.extend_from_slice(&fd_packet(frame)),
                 None => out.extend_from_slice(&packet(&record.event)),
             }
-            match &record.event {
-                TraceEvent::Frame { direction: Direction::Tx, .. } => {
-                    option(out, EPB_FLAGS, &OUTBOUND.to_le_bytes());
-                    option(out, END, &[]);
-                }
-                TraceEvent::Lost { count, .. } => {
-                    option(out, EPB_DROPCOUNT, &u64::from(*count).to_le_bytes());
-                    option(out, END, &[]);
-                }
-                _ => {}
+            let before = out.len();
+            for text in remarks.iter().chain(&comment) {
+                option(out, COMMENT, cut(text).as_bytes());
+            }
+            if let Some(flags) = flags {
+                option(out, EPB_FLAGS, &flags.to_le_bytes());
+            }
+            if let Some(dropped) = dropped {
+                option(out, EPB_DROPCOUNT, &dropped.to_le_bytes());
+            }
+            if out.len() > before {
+                option(out, END, &[]);
             }
         });
+    }
+
+    fn carries_late(&self) -> bool {
+        true
+    }
+
+    fn flush(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
+        let Some(every) = self.statistics_every else { return };
+        if !self.started {
+            self.start(out);
+        }
+        if self.counted.is_none_or(|counted| counted.elapsed() >= every) {
+            self.statistics(now_ns(), out);
+        }
+    }
+
+    fn remark(&mut self, channel: u8, text: &str) {
+        if let Some(interface) = self.interfaces.iter_mut().find(|interface| interface.channel == channel) {
+            interface.remarks.push(text.to_owned());
+        }
     }
 
     fn finish(&mut self, out: &mut Vec<u8>, _left_out: &mut LeftOut) {
         if !self.started {
             self.start(out);
+        }
+        // Of a file, the end is where its last record is.
+        let end_ns = if self.statistics_every.is_some() { Some(now_ns()) } else { self.latest_ns };
+        if let Some(end_ns) = end_ns {
+            self.statistics(end_ns, out);
         }
     }
 

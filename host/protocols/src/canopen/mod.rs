@@ -6,6 +6,7 @@
 //! Memory: for each node of each channel one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
 
 pub mod eds;
+mod encode;
 mod lss;
 mod names;
 mod pdo;
@@ -14,6 +15,11 @@ mod signs;
 #[cfg(test)]
 mod tests;
 mod types;
+
+pub use encode::{BadValue, encode, type_named};
+pub use names::{abort as abort_text, state as state_name};
+pub(crate) use sdo::crc_of;
+pub use types::known as known_type;
 
 use std::borrow::Cow;
 use std::sync::Arc;
@@ -26,7 +32,7 @@ use self::lss::Lss;
 use self::pdo::Pdos;
 use self::sdo::{Sdo, SdoTransfer};
 pub(crate) use self::signs::CanOpenSigns;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const SWEEP_NS: i64 = 50_000_000;
 /// A heartbeat is missed after this many of its periods.
@@ -425,5 +431,24 @@ impl Assembler for CanOpen {
             }
         }
         events[from..].sort_by_key(|event| (event.time_ns, event.channel, event.to.node()));
+    }
+
+    fn under_way(&self, out: &mut Vec<UnderWay>) {
+        for (&channel, bus) in &self.buses {
+            let open = bus.nodes.iter().filter_map(|(node, entry)| Some((*node, entry.sdo.open.as_ref()?)));
+            out.extend(open.map(|(node, transfer)| {
+                let (server, client) = (Party::Node(node), Party::Unknown);
+                let (from, to) = if transfer.is_write { (client, server) } else { (server, client) };
+                UnderWay {
+                    channel,
+                    protocol: Protocol::CanOpen,
+                    from,
+                    to,
+                    start_ns: transfer.start_ns,
+                    received: transfer.data.len() as u32,
+                    length: transfer.size,
+                }
+            }));
+        }
     }
 }

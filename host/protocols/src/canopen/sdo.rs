@@ -394,7 +394,7 @@ fn fresh(time_ns: i64, bytes: [u8; 8], is_write: bool, mode: Mode) -> SdoTransfe
 }
 
 /// CRC-16 with the polynomial 1021, from 0 (CiA 301, 7.2.4.3.16).
-fn crc_of(bytes: &[u8]) -> u16 {
+pub fn crc_of(bytes: &[u8]) -> u16 {
     bytes.iter().fold(0, |crc, byte| {
         (0..8).fold(
             crc ^ u16::from(*byte) << 8,

@@ -13,7 +13,10 @@ mod tests;
 mod uds;
 
 pub use dtc::Dtc;
+pub(crate) use names::has_sub_function;
 pub use names::{data_identifier, reason, uds_service};
+pub use obd::name as parameter_name;
+pub(crate) use uds::is_response_suppressed;
 
 use std::borrow::Cow;
 use std::collections::VecDeque;
@@ -22,7 +25,7 @@ use cantap_trace::TraceRecord;
 use rustc_hash::FxHashSet;
 
 use crate::iso_tp::{Endpoint, Pair, Transfer, Transport};
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// Requests that wait for a response at the same time.
 const MOST_WAITING: usize = 256;
@@ -307,5 +310,9 @@ impl Assembler for Diagnostics {
         while !self.waiting.is_empty() {
             self.give_up(0, Trouble::Unfinished, events);
         }
+    }
+
+    fn under_way(&self, out: &mut Vec<UnderWay>) {
+        self.transport.under_way(out);
     }
 }

@@ -1,6 +1,10 @@
 //! Finds pairs by what they do: a first frame, a flow control frame of somebody else, and the first consecutive frame.
+//!
+//! Every frame of a bus comes by here whose identifier belongs to no pair, and most are no part of any transfer. So what can be
+//! told from a frame alone is, before the candidates are looked at, and a candidate takes no memory of its own.
 
 use cantap_trace::Id;
+use cantap_trace::fd::FD_MAX_BYTES;
 
 use super::pairs::{Endpoint, Pair};
 use super::pci::{self, FlowStatus, Pci};
@@ -18,14 +22,44 @@ struct Candidate {
     from: Endpoint,
     time_ns: i64,
     length: u32,
-    data: Vec<u8>,
+    /// The first bytes, and how many.
+    data: ([u8; FD_MAX_BYTES], u8),
     flow: Option<(Endpoint, u8, u32)>,
+}
+
+/// Marks of the candidates' senders: an identifier without its mark is no candidate's.
+#[derive(Clone, Copy, Debug)]
+struct Marks([u64; 16]);
+
+impl Default for Marks {
+    fn default() -> Self {
+        Self([0; 16])
+    }
+}
+
+impl Marks {
+    /// Word and bit. Neighbouring identifiers, as most buses have, fall on different marks.
+    const fn place(id: Id) -> (usize, u64) {
+        let mark = id.raw() ^ id.raw() >> 10 ^ id.raw() >> 20;
+        ((mark >> 6 & 15) as usize, 1 << (mark & 63))
+    }
+
+    fn set(&mut self, id: Id) {
+        let (word, bit) = Self::place(id);
+        self.0[word] |= bit;
+    }
+
+    fn may_have(&self, id: Id) -> bool {
+        let (word, bit) = Self::place(id);
+        self.0[word] & bit != 0
+    }
 }
 
 /// Looks for pairs among identifiers that belong to none.
 #[derive(Clone, Debug, Default)]
 pub(super) struct Finder {
     candidates: Vec<Candidate>,
+    marks: Marks,
 }
 
 impl Finder {
@@ -33,35 +67,40 @@ impl Finder {
     /// to be taken as such.
     pub fn take(&mut self, channel: u8, id: Id, bytes: &[u8], time_ns: i64) -> Option<(Pair, Transfer)> {
         // Who sends anything else before its first consecutive frame sends no transfer.
-        if !self.candidates.is_empty() {
+        if self.marks.may_have(id) {
             let goes_on = |candidate: &Candidate| {
                 let place = usize::from(candidate.from.address.is_some());
                 bytes.get(place) == Some(&0x21) && candidate.flow.is_some()
             };
+            let before = self.candidates.len();
             self.candidates.retain(|candidate| {
                 (candidate.channel, candidate.from.id) != (channel, id) || goes_on(candidate)
             });
+            if self.candidates.len() < before {
+                self.mark();
+            }
         }
         // The address may be in front of it or not.
         for offset in [0, 1] {
             let Some(&first) = bytes.get(offset) else { continue };
             match first >> 4 {
                 1 | 3 => {}
-                2 if !self.candidates.is_empty() => {}
+                2 if self.marks.may_have(id) => {}
                 _ => continue,
             }
             let Ok(Some(pci)) = pci::parse(bytes, offset) else { continue };
             let from = Endpoint { id, address: (offset == 1).then(|| bytes[0]) };
             match pci {
                 Pci::First { length, data } if length <= 4095 => {
-                    self.candidates.retain(|old| {
-                        (old.channel, old.from) != (channel, from) && time_ns - old.time_ns <= FLOW_TIMEOUT_NS
-                    });
                     if self.candidates.len() == MOST_CANDIDATES {
-                        self.candidates.remove(0);
+                        // The oldest, which is the first to be too old.
+                        self.candidates.swap_remove(self.oldest());
                     }
-                    let data = data.to_vec();
+                    let mut kept = [0; FD_MAX_BYTES];
+                    kept[..data.len()].copy_from_slice(data);
+                    let data = (kept, data.len() as u8);
                     self.candidates.push(Candidate { channel, from, time_ns, length, data, flow: None });
+                    self.marks.set(id);
                 }
                 Pci::Flow { status: FlowStatus::Go, block_size, separation_us }
                     if is_padded(&bytes[offset + 3..]) =>
@@ -83,7 +122,8 @@ impl Finder {
                         (candidate.channel, candidate.from) == (channel, from) && candidate.flow.is_some()
                     });
                     if let Some(place) = place {
-                        let found = self.candidates.remove(place);
+                        let found = self.candidates.swap_remove(place);
+                        self.mark();
                         let (to, block_size, separation_us) = found.flow?;
                         let transfer = Transfer {
                             time_ns: found.time_ns,
@@ -91,7 +131,7 @@ impl Finder {
                             channel,
                             from,
                             to: Some(to),
-                            data: found.data,
+                            data: found.data.0[..usize::from(found.data.1)].to_vec(),
                             length: found.length,
                             frames: 2,
                             block_size: Some(block_size),
@@ -110,6 +150,18 @@ impl Finder {
     /// Frames of the channel are missing: what comes next may belong to others.
     pub fn interrupt(&mut self, channel: u8) {
         self.candidates.retain(|candidate| candidate.channel != channel);
+        self.mark();
+    }
+
+    fn oldest(&self) -> usize {
+        let times = self.candidates.iter().enumerate().map(|(place, candidate)| (candidate.time_ns, place));
+        times.min().map_or(0, |(_, place)| place)
+    }
+
+    /// Marks those that are left.
+    fn mark(&mut self) {
+        self.marks = Marks::default();
+        self.candidates.iter().for_each(|candidate| self.marks.set(candidate.from.id));
     }
 }
 

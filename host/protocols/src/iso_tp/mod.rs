@@ -22,7 +22,7 @@ use rustc_hash::FxHashMap;
 
 use self::finder::Finder;
 use self::pairs::Pairs;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 /// How long the receiver waits for the next frame: N_Cr.
 const NEXT_TIMEOUT_NS: i64 = 1_000_000_000;
@@ -110,6 +110,19 @@ impl Transport {
             end(open, Trouble::Unfinished, out);
         }
         self.headless.clear();
+    }
+
+    /// Appends the transfers under way.
+    pub fn under_way(&self, out: &mut Vec<UnderWay>) {
+        out.extend(self.open.values().map(|Open { transfer, .. }| UnderWay {
+            channel: transfer.channel,
+            protocol: Protocol::IsoTp,
+            from: transfer.from.into(),
+            to: transfer.to.map_or(Party::Unknown, Party::from),
+            start_ns: transfer.start_ns,
+            received: transfer.data.len() as u32,
+            length: Some(transfer.length),
+        }));
     }
 
     /// Frames of the channel are missing.
@@ -307,6 +320,10 @@ impl Assembler for IsoTp {
 
     fn finish(&mut self, events: &mut Vec<Event>) {
         self.transport.finish(&mut |transfer| events.push(transfer.into()));
+    }
+
+    fn under_way(&self, out: &mut Vec<UnderWay>) {
+        self.transport.under_way(out);
     }
 }
 

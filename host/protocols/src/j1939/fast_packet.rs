@@ -35,6 +35,11 @@ impl FastPackets {
         }
     }
 
+    /// Those under way.
+    pub fn open(&self) -> impl Iterator<Item = &Assembled> {
+        self.open.values().map(|(message, _)| message)
+    }
+
     /// Ends what has waited for too long.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
         if self.open.is_empty() || now_ns < self.sweep_ns {

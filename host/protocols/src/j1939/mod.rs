@@ -25,7 +25,7 @@ use self::fast_packet::FastPackets;
 use self::header::{GLOBAL, NULL, party};
 use self::transport::{Assembled, LongMessages};
 use crate::nmea2000;
-use crate::{Assembler, Event, Field, Party, Protocol, Trouble, is_gap};
+use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGEMENT: u32 = 0xE800;
@@ -53,6 +53,8 @@ struct Request {
 pub struct J1939 {
     /// NMEA 2000's part.
     marine: Option<FastPackets>,
+    /// Both are on this bus: what only NMEA 2000 gives a meaning is its own, the rest J1939's.
+    tells_apart: bool,
     transport: LongMessages,
     requests: VecDeque<Request>,
     names: FxHashMap<(u8, u8), u64>,
@@ -71,8 +73,17 @@ impl J1939 {
         Self { marine: Some(FastPackets::default()), ..Self::new(decoder) }
     }
 
-    const fn protocol(&self) -> Protocol {
-        if self.marine.is_some() { Protocol::Nmea2000 } else { Protocol::J1939 }
+    /// For a bus that has both.
+    pub fn with_nmea2000(decoder: Option<Arc<Decoder>>) -> Self {
+        Self { tells_apart: true, ..Self::nmea2000(decoder) }
+    }
+
+    fn protocol(&self, pgn: u32) -> Protocol {
+        match &self.marine {
+            None => Protocol::J1939,
+            Some(_) if self.tells_apart && !nmea2000::is_own(pgn) => Protocol::J1939,
+            Some(_) => Protocol::Nmea2000,
+        }
     }
 
     fn frame(&mut self, record: &TraceRecord, header: Header, data: &[u8], events: &mut Vec<Event>) {
@@ -125,7 +136,7 @@ impl J1939 {
     fn event(&self, record: &TraceRecord, header: Header, kind: &'static str) -> Event {
         let title =
             names::group(header.pgn).map_or_else(|| format!("PGN {}", header.pgn).into(), Cow::Borrowed);
-        let mut event = Event::new(self.protocol(), record, kind, title);
+        let mut event = Event::new(self.protocol(header.pgn), record, kind, title);
         (event.from, event.to) = (party(header.source), party(header.destination));
         event.fields.reserve(4);
         event.fields.push(Field::number("pgn", header.pgn));
@@ -382,6 +393,19 @@ impl Assembler for J1939 {
             let record = TraceRecord { time_ns: request.time_ns, ..record };
             self.unanswered(request, Trouble::Unfinished, &record, events);
         }
+    }
+
+    fn under_way(&self, out: &mut Vec<UnderWay>) {
+        let messages = self.transport.open().chain(self.marine.iter().flat_map(FastPackets::open));
+        out.extend(messages.map(|message| UnderWay {
+            channel: message.channel,
+            protocol: self.protocol(message.header.pgn),
+            from: party(message.header.source),
+            to: party(message.header.destination),
+            start_ns: message.start_ns,
+            received: message.data.len() as u32,
+            length: Some(message.size),
+        }));
     }
 }
 

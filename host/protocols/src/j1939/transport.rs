@@ -111,6 +111,11 @@ impl LongMessages {
         }
     }
 
+    /// Those under way.
+    pub fn open(&self) -> impl Iterator<Item = &Assembled> {
+        self.open.values().map(|open| &open.message)
+    }
+
     /// Ends what has waited for too long.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
         if self.open.is_empty() || now_ns < self.sweep_ns {

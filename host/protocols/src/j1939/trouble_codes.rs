@@ -26,6 +26,7 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
         fields.push(Field::text(name, state));
     }
     let mut text = String::new();
+    let mut each = Vec::new();
     let mut count = 0;
     for code in codes.chunks_exact(4).filter(|code| **code != [0; 4] && **code != [0xFF; 4]) {
         let spn = u32::from(code[0]) | u32::from(code[1]) << 8 | u32::from(code[2] >> 5) << 16;
@@ -39,10 +40,16 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
         if code[3] & 0x80 != 0 {
             text.push_str(" in an old conversion, whose number may be another");
         }
+        each.push(Field::number("spn", spn));
+        each.push(Field::number("fmi", fmi));
+        if times != 0x7F {
+            each.push(Field::number("occurrences", times));
+        }
         count += 1;
     }
     fields.push(Field::number("trouble_codes", count));
     if count > 0 {
         fields.push(Field::text("codes", text));
+        fields.append(&mut each);
     }
 }

@@ -14,6 +14,10 @@ const COMPRESSED: &[u8] = include_bytes!("../../data/canboat.json.gz");
 pub struct Database {
     /// By number, then in the order of the file.
     groups: Vec<Group>,
+    /// Where those of a number are, and how many.
+    places: FxHashMap<u32, (usize, usize)>,
+    /// The places of those that stand for a range of numbers, by the first of it.
+    fallbacks: Vec<usize>,
     pub lookups: FxHashMap<String, FxHashMap<u64, String>>,
     pub bits: FxHashMap<String, FxHashMap<u64, String>>,
     /// By the other field's value and this one's.
@@ -173,6 +177,12 @@ impl Database {
         let file: File = serde_json::from_slice(&text).ok()?;
         let mut groups = file.groups;
         groups.sort_by_key(|group| group.pgn);
+        let mut places = FxHashMap::<u32, (usize, usize)>::default();
+        for (place, group) in groups.iter().enumerate() {
+            places.entry(group.pgn).or_insert((place, 0)).1 += 1;
+        }
+        let fallbacks = groups.iter().enumerate().filter(|(_, group)| group.fallback);
+        let fallbacks = fallbacks.map(|(place, _)| place).collect();
         let simple = |entries: Vec<Entry>| {
             let numbered = |entry: Entry| Some((entry.value.or(entry.bit)?, entry.name));
             entries.into_iter().filter_map(numbered).collect::<FxHashMap<_, _>>()
@@ -182,6 +192,8 @@ impl Database {
             #[cfg(test)]
             entries: groups.len(),
             groups,
+            places,
+            fallbacks,
             lookups: file
                 .lookup_enumerations
                 .into_iter()
@@ -210,15 +222,13 @@ impl Database {
 
     /// Those that share a number.
     pub fn groups(&self, pgn: u32) -> &[Group] {
-        let first = self.groups.partition_point(|group| group.pgn < pgn);
-        let count = self.groups[first..].partition_point(|group| group.pgn == pgn);
-        &self.groups[first..first + count]
+        self.places.get(&pgn).map_or(&[], |&(first, count)| &self.groups[first..first + count])
     }
 
     /// The one that stands for a range of numbers whose meaning is not known.
     pub fn fallback(&self, pgn: u32) -> Option<&Group> {
-        let before = self.groups.partition_point(|group| group.pgn <= pgn);
-        self.groups[..before].iter().rev().find(|group| group.fallback)
+        let before = self.fallbacks.partition_point(|&place| self.groups[place].pgn <= pgn);
+        self.fallbacks[..before].last().map(|&place| &self.groups[place])
     }
 
     #[cfg(test)]

@@ -32,6 +32,11 @@ pub(crate) fn describe(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> Option
     (!group.fallback).then_some(Cow::Borrowed(group.description.as_str()))
 }
 
+/// Whether a bus that has both means NMEA 2000's group by this number.
+pub(crate) fn is_own(pgn: u32) -> bool {
+    (0x1_F000..0x2_0000).contains(&pgn) || is_fast(pgn)
+}
+
 /// Whether the group is one that only NMEA 2000 gives a meaning.
 pub(crate) fn is_known(pgn: u32) -> bool {
     // The second page, but for what is the manufacturers'.

@@ -8,7 +8,7 @@ use cantap::{Direction, TraceEvent, TraceRecord};
 use cantap_wire::{Frame, Id};
 
 use super::subscriptions::Subscriptions;
-use super::told::{put_error, put_frame};
+use super::told::{now_ns, put_error, put_frame};
 
 /// What a client hears, by its mode.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -76,14 +76,16 @@ impl Hearing {
             }
             self.take_one(record, out);
         }
+        // On a bus that fell silent, no record says what time it is.
+        if self.hears == Hears::Subscribed {
+            self.put_ripe(now_ns(), out);
+        }
         self.put_statistics(out);
     }
 
     fn take_one(&mut self, record: &TraceRecord, out: &mut String) {
         let time_ns = record.time_ns;
-        for (time_ns, frame) in self.subscriptions.ripe(time_ns) {
-            put_frame(out, time_ns, &frame, false);
-        }
+        self.put_ripe(time_ns, out);
         match &record.event {
             TraceEvent::Frame { frame, direction, .. } => {
                 let Some(frame) = frame.classic() else { return };
@@ -113,6 +115,13 @@ impl Hearing {
                     put_error(out, time_ns, event);
                 }
             }
+        }
+    }
+
+    /// Adds what an interval held back until `now_ns`.
+    fn put_ripe(&mut self, now_ns: i64, out: &mut String) {
+        for (time_ns, frame) in self.subscriptions.ripe(now_ns) {
+            put_frame(out, time_ns, &frame, false);
         }
     }
 

@@ -40,6 +40,11 @@ const BEACON_EVERY: Duration = Duration::from_secs(2);
 const BETWEEN_ANSWERS: Duration = Duration::from_millis(20);
 /// And no frame right behind the answer to `rawmode`.
 const BEFORE_FRAMES: Duration = Duration::from_millis(100);
+/// SavvyCAN connects anew after ten seconds in which it was told nothing, which loses what is on the bus meanwhile.
+const KEEP_ALIVE_EVERY: Duration = Duration::from_secs(7);
+/// What a client is told then: the protocol's own word for "still here". SavvyCAN and Kayak pass over it; python-can does too, with a
+/// warning in its log. No client tells which it is, and a frame that SavvyCAN misses is worse than a warning.
+const KEEP_ALIVE: &str = "< echo >";
 /// A client that has not opened a bus by then is let go.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(30);
 /// A client that takes nothing for this long is gone.
@@ -136,6 +141,8 @@ struct Connection {
     buses: Arc<[Bus]>,
     role: Role,
     hearing: Mutex<Hearing>,
+    /// When it was last told something.
+    told_at: Mutex<Instant>,
     is_over: AtomicBool,
 }
 
@@ -174,6 +181,7 @@ impl Connection {
             buses,
             role,
             hearing: Mutex::default(),
+            told_at: Mutex::new(Instant::now()),
             is_over: AtomicBool::new(false),
         }))
     }
@@ -223,6 +231,10 @@ impl Connection {
     }
 
     fn write(&self, text: &str) -> io::Result<()> {
+        if text.is_empty() {
+            return Ok(());
+        }
+        *lock(&self.told_at) = Instant::now();
         write_patiently(&mut *lock(&self.output), text.as_bytes(), PATIENCE)
     }
 
@@ -372,12 +384,20 @@ impl Connection {
                 std::thread::sleep(wait);
             }
             records.recycle(batch);
+            if out.is_empty() && self.must_be_told() {
+                out.push_str(KEEP_ALIVE);
+            }
             if self.write(&out).is_err() {
                 break;
             }
             out.clear();
         }
         self.is_over.store(true, Ordering::Relaxed);
+    }
+
+    /// Whether a client that reads frames alone has been told nothing for too long.
+    fn must_be_told(&self) -> bool {
+        lock(&self.told_at).elapsed() >= KEEP_ALIVE_EVERY && lock(&self.hearing).hears == Hears::All
     }
 
     fn subscribe(&self, id: Id, wanted: Wanted, interval_us: u64) -> Result<(), String> {

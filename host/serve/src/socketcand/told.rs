@@ -33,12 +33,16 @@ pub fn put_error(out: &mut String, time_ns: i64, event: &TraceEvent) {
     out.push_str(" >");
 }
 
+/// The time of this computer, in UTC nanoseconds since the Unix epoch.
+pub fn now_ns() -> i64 {
+    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
+    now.map_or(0, |since| since.as_nanos() as i64)
+}
+
 /// A frame was refused, which raw mode has no words for.
 pub fn not_sent() -> String {
-    let now = std::time::SystemTime::now().duration_since(std::time::UNIX_EPOCH);
-    let now_ns = now.map_or(0, |since| since.as_nanos() as i64);
     let mut out = String::new();
-    put_error(&mut out, now_ns, &TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted });
+    put_error(&mut out, now_ns(), &TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted });
     out
 }
 

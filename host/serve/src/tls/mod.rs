@@ -27,6 +27,8 @@ use stream::{Secured, shake_hands};
 
 /// A peer that has not shown its certificate by then is let go.
 const HANDSHAKE_TIMEOUT: Duration = Duration::from_secs(5);
+/// A server that lets a client in gives it tickets at once.
+const VERDICT_TIMEOUT: Duration = Duration::from_secs(1);
 /// Peers at a time that have not.
 const MOST_HANDSHAKES: usize = 16;
 
@@ -184,6 +186,7 @@ pub fn connect(address: &str, files: &Files) -> Result<Link, TlsError> {
     let connection = ClientConnection::new(Arc::new(config), host).map_err(setup)?;
     let stream = dial(address)?;
     let secured = shake_hands(stream, Connection::Client(connection), Instant::now() + HANDSHAKE_TIMEOUT)?;
+    secured.wait_for_verdict(Instant::now() + VERDICT_TIMEOUT)?;
     let (reader, writer) = secured.split();
     Ok(Link::new(reader, writer))
 }

@@ -78,6 +78,28 @@ fn step(mut stream: &TcpStream, connection: &mut Connection) -> io::Result<()> {
 }
 
 impl Secured {
+    /// Waits for the first thing that the other side says after the handshake. In TLS 1.3 a client is through before the server has
+    /// looked at its certificate: an error says that it did not like it. A server that says nothing may do so.
+    pub fn wait_for_verdict(&self, deadline: Instant) -> io::Result<()> {
+        let mut raw = vec![0; PIECE];
+        while Instant::now() < deadline {
+            let len = match (&self.0.stream).read(&mut raw) {
+                Ok(0) => return Err(io::ErrorKind::UnexpectedEof.into()),
+                Ok(len) => len,
+                Err(error) if is_idle(&error) => continue,
+                Err(error) => return Err(error),
+            };
+            let mut connection = lock(&self.0.connection);
+            let mut raw = &raw[..len];
+            while !raw.is_empty() {
+                connection.read_tls(&mut raw)?;
+                connection.process_new_packets().map_err(io::Error::other)?;
+            }
+            return Ok(());
+        }
+        Ok(())
+    }
+
     /// The other side's own certificate.
     pub fn peer_certificate(&self) -> Option<CertificateDer<'static>> {
         let connection = lock(&self.0.connection);

@@ -5,6 +5,7 @@ use cantap_trace::fd::FD_MAX_BYTES;
 use cantap_trace::{TraceEvent, TraceRecord};
 
 use super::error::{ConditionError, ConditionFault};
+use super::listener::{Deaf, Listener, Listening, Said};
 use super::syntax::{self, Kind, Node, Operator};
 
 /// A condition, with the last values of the signals it speaks of.
@@ -18,6 +19,8 @@ pub struct Condition {
     about_frames: bool,
     values: Vec<SignalValue>,
     concerned: bool,
+    /// For names that a listener knows; none without them.
+    listening: Option<Listening>,
 }
 
 /// A signal that the condition names. The same name may stand for signals of several messages.
@@ -49,6 +52,14 @@ enum Expression {
     Signal(usize),
     /// Whether a signal's value has a text: for each candidate the raw values with that text.
     HasText(usize, Vec<Vec<i64>>),
+    /// The first value of a listener's name, by its place among the names.
+    Said(usize),
+    /// Whether there is a value of it.
+    IsSaid(usize),
+    /// Whether one of its values compares so with the other side; `true` if the name is on the left.
+    AnySaid(usize, Operator, Box<Expression>, bool),
+    /// Whether one of its values is this text.
+    SaidText(usize, String),
     Not(Box<Expression>),
     Negative(Box<Expression>),
     Binary(Operator, Box<Expression>, Box<Expression>),
@@ -71,32 +82,83 @@ fn part(name: &str) -> Option<Part> {
 impl Condition {
     /// Parses a condition; its signals are those of the decoder's databases.
     pub fn new(text: &str, decoder: &Decoder) -> Result<Self, ConditionError> {
+        Self::with_listener(text, decoder, Box::new(Deaf))
+    }
+
+    /// The same, with the listener's names beside signals, which go before them.
+    pub fn with_listener(
+        text: &str,
+        decoder: &Decoder,
+        mut listener: Box<dyn Listener>,
+    ) -> Result<Self, ConditionError> {
         let tree = syntax::parse(text)?;
-        let mut binder = Binder { decoder, slots: Vec::new(), about_frames: false };
-        let expression = binder.bind(&tree).map_err(|(at, fault)| {
+        let mut binder = Binder {
+            decoder,
+            slots: Vec::new(),
+            about_frames: false,
+            listener: &mut *listener,
+            names: Vec::new(),
+        };
+        let expression = binder.truth(&tree).map_err(|(at, fault)| {
             let text = text.to_owned();
             ConditionError { text, at, fault }
         })?;
-        let Binder { slots, about_frames, .. } = binder;
+        let Binder { slots, about_frames, names, .. } = binder;
+        let names: Vec<_> = names.into_iter().map(|name| (name, false)).collect();
+        let listening = (!names.is_empty()).then(|| Listening { listener, names, matched: Vec::new() });
         let mut own = decoder.clone();
         own.retain(|message, index, _| {
             slots.iter().any(|slot| slot.candidates.contains(&(message, index as u32)))
         });
         // A condition without names is looked at for every record.
-        let about_frames = about_frames || slots.is_empty();
-        Ok(Self { expression, decoder: own, slots, about_frames, values: Vec::new(), concerned: false })
+        let about_frames = about_frames || slots.is_empty() && listening.is_none();
+        let (values, concerned) = (Vec::new(), false);
+        Ok(Self { expression, decoder: own, slots, about_frames, values, concerned, listening })
     }
 
     /// Takes a record and says whether the condition holds now, as far as this record has to do
     /// with it.
     pub fn holds(&mut self, record: &TraceRecord) -> bool {
         self.concerned = self.update(record) || self.about_frames;
-        self.concerned && truth(self.evaluate(&self.expression, record)) == Some(true)
+        let holds = self.concerned && self.is_true(record, None);
+        let Some(mut listening) = self.listening.take() else { return holds };
+        let Listening { listener, names, matched } = &mut listening;
+        matched.clear();
+        let mut was_said = false;
+        listener.take(record, &mut |said| {
+            was_said = true;
+            for (name, was_heard) in names.iter_mut().filter(|(_, was_heard)| !was_heard) {
+                *was_heard = said.has(name) == Some(true);
+            }
+            let said = Heard { said, names };
+            if self.is_true(record, Some(&said)) {
+                matched.push(said.said.describe());
+            }
+        });
+        let holds = holds || !matched.is_empty();
+        self.concerned |= was_said;
+        self.listening = Some(listening);
+        holds
     }
 
-    /// Whether it speaks of the frame itself and not of signals alone.
+    fn is_true(&self, record: &TraceRecord, said: Option<&Heard<'_>>) -> bool {
+        truth(self.evaluate(&self.expression, record, said)) == Some(true)
+    }
+
+    /// Whether it speaks of the frame itself, or of what frames say together, and not of signals alone.
     pub fn is_about_frames(&self) -> bool {
-        self.about_frames
+        self.about_frames || self.listening.is_some()
+    }
+
+    /// What was said with the record that [`Self::holds`] took last, and made the condition hold; a line each.
+    pub fn said(&self) -> &[String] {
+        self.listening.as_ref().map_or(&[], |listening| &listening.matched)
+    }
+
+    /// The listener's names in the condition that no event had so far: perhaps there are none such.
+    pub fn unheard(&self) -> impl Iterator<Item = &str> {
+        let names = self.listening.iter().flat_map(|listening| &listening.names);
+        names.filter(|(_, was_heard)| !was_heard).map(|(name, _)| name.as_str())
     }
 
     /// Whether the record that [`Self::holds`] took last has to do with the condition: it carries one of
@@ -122,13 +184,24 @@ impl Condition {
         !self.values.is_empty()
     }
 
-    fn evaluate(&self, expression: &Expression, record: &TraceRecord) -> Option<f64> {
+    fn evaluate(
+        &self,
+        expression: &Expression,
+        record: &TraceRecord,
+        said: Option<&Heard<'_>>,
+    ) -> Option<f64> {
         let boolean = |truth: bool| Some(f64::from(u8::from(truth)));
         match expression {
             Expression::Number(value) => Some(*value),
-            Expression::Part(part) => part_of(*part, record),
+            Expression::Part(part) => match said {
+                Some(heard) if matches!(part, Part::Channel) => Some(heard.said.channel().into()),
+                // What ends because nothing came is said with a frame that it has nothing to do with.
+                Some(heard) if !heard.said.is_completed_by(record) => None,
+                _ => part_of(*part, record),
+            },
+            Expression::Byte(_) if said.is_some_and(|heard| !heard.said.is_completed_by(record)) => None,
             Expression::Byte(index) => {
-                let index = byte_index(self.evaluate(index, record)?)?;
+                let index = byte_index(self.evaluate(index, record, said)?)?;
                 record.frame()?.data().get(index).copied().map(f64::from)
             }
             Expression::Signal(slot) => self.slots[*slot].last.map(|(_, _, value)| value),
@@ -138,17 +211,33 @@ impl Condition {
                 let signal = &self.decoder.message(message).signals[index as usize];
                 boolean(signal.table_key(raw).is_some_and(|key| raws[candidate].contains(&key)))
             }
-            Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record))?),
-            Expression::Negative(inner) => self.evaluate(inner, record).map(|value| -value),
+            Expression::Said(name) => said?.numbers(*name).first().copied(),
+            Expression::IsSaid(name) => boolean(said?.has(*name)?),
+            Expression::AnySaid(name, operator, other, is_left) => {
+                let (heard, other) = (said?, self.evaluate(other, record, said)?);
+                let numbers = heard.numbers(*name);
+                let compare = |number: f64| {
+                    let (left, right) = if *is_left { (number, other) } else { (other, number) };
+                    truth(binary(*operator, left, right))
+                };
+                if numbers.is_empty() {
+                    None
+                } else {
+                    boolean(numbers.iter().any(|number| compare(*number) == Some(true)))
+                }
+            }
+            Expression::SaidText(name, text) => boolean(said?.is_text(*name, text)?),
+            Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record, said))?),
+            Expression::Negative(inner) => self.evaluate(inner, record, said).map(|value| -value),
             Expression::Binary(operator, left, right) => {
-                let left = self.evaluate(left, record);
+                let left = self.evaluate(left, record, said);
                 // One side may decide alone, whatever the other is.
                 match (operator, truth(left)) {
                     (Operator::And, Some(false)) => return boolean(false),
                     (Operator::Or, Some(true)) => return boolean(true),
                     _ => {}
                 }
-                let right = self.evaluate(right, record);
+                let right = self.evaluate(right, record, said);
                 match (operator, truth(right)) {
                     (Operator::And, Some(false)) => return boolean(false),
                     (Operator::Or, Some(true)) => return boolean(true),
@@ -157,6 +246,28 @@ impl Condition {
                 binary(*operator, left?, right?)
             }
         }
+    }
+}
+
+/// An event, by the places of the condition's names.
+struct Heard<'a> {
+    said: &'a dyn Said,
+    names: &'a [(String, bool)],
+}
+
+impl Heard<'_> {
+    fn numbers(&self, name: usize) -> Vec<f64> {
+        let mut numbers = Vec::new();
+        self.said.numbers(&self.names[name].0, &mut |number| numbers.push(number));
+        numbers
+    }
+
+    fn has(&self, name: usize) -> Option<bool> {
+        self.said.has(&self.names[name].0)
+    }
+
+    fn is_text(&self, name: usize, text: &str) -> Option<bool> {
+        self.said.is_text(&self.names[name].0, text)
     }
 }
 
@@ -231,11 +342,22 @@ struct Binder<'a> {
     decoder: &'a Decoder,
     slots: Vec<Slot>,
     about_frames: bool,
+    listener: &'a mut dyn Listener,
+    /// Of the listener's.
+    names: Vec<String>,
 }
 
 type Fault = (usize, ConditionFault);
 
 impl Binder<'_> {
+    /// What is asked whether it is true: there a listener's name alone asks whether it was said.
+    fn truth(&mut self, node: &Node) -> Result<Expression, Fault> {
+        Ok(match self.bind(node)? {
+            Expression::Said(name) => Expression::IsSaid(name),
+            other => other,
+        })
+    }
+
     fn bind(&mut self, node: &Node) -> Result<Expression, Fault> {
         Ok(match &node.kind {
             Kind::Number(value) => Expression::Number(*value),
@@ -249,18 +371,42 @@ impl Binder<'_> {
                 }
                 Expression::Byte(bound.into())
             }
-            Kind::Not(inner) => Expression::Not(self.bind(inner)?.into()),
+            Kind::Not(inner) => Expression::Not(self.truth(inner)?.into()),
+            Kind::Binary(operator @ (Operator::And | Operator::Or), left, right) => {
+                Expression::Binary(*operator, self.truth(left)?.into(), self.truth(right)?.into())
+            }
             Kind::Negative(inner) => Expression::Negative(self.bind(inner)?.into()),
             Kind::Binary(operator @ (Operator::Equal | Operator::NotEqual), left, right) => {
                 match self.text_comparison(left, right)? {
                     Some(has_text) if *operator == Operator::Equal => has_text,
                     Some(has_text) => Expression::Not(has_text.into()),
-                    None => Expression::Binary(*operator, self.bind(left)?.into(), self.bind(right)?.into()),
+                    None => self.comparison(*operator, left, right)?,
                 }
             }
-            Kind::Binary(operator, left, right) => {
-                Expression::Binary(*operator, self.bind(left)?.into(), self.bind(right)?.into())
+            Kind::Binary(operator, left, right) => self.comparison(*operator, left, right)?,
+        })
+    }
+
+    /// Of what was said several times, one is enough.
+    fn comparison(&mut self, operator: Operator, left: &Node, right: &Node) -> Result<Expression, Fault> {
+        let (left, right) = (self.bind(left)?, self.bind(right)?);
+        let compares = matches!(
+            operator,
+            Operator::Equal
+                | Operator::NotEqual
+                | Operator::Less
+                | Operator::LessOrEqual
+                | Operator::Greater
+                | Operator::GreaterOrEqual
+        );
+        Ok(match (left, right) {
+            (Expression::Said(name), right) if compares => {
+                Expression::AnySaid(name, operator, right.into(), true)
             }
+            (left, Expression::Said(name)) if compares => {
+                Expression::AnySaid(name, operator, left.into(), false)
+            }
+            (left, right) => Expression::Binary(operator, left.into(), right.into()),
         })
     }
 
@@ -271,6 +417,9 @@ impl Binder<'_> {
         if let Some(part) = part(name) {
             self.about_frames = true;
             return Ok(Expression::Part(part));
+        }
+        if let Some(said) = self.said(name) {
+            return Ok(Expression::Said(said));
         }
         if self.decoder.signals().next().is_none() {
             return Err((at, ConditionFault::NoDatabase(name.to_owned())));
@@ -304,6 +453,17 @@ impl Binder<'_> {
         Some(self.slots.len() - 1)
     }
 
+    /// The place of a listener's name, if it is one.
+    fn said(&mut self, name: &str) -> Option<usize> {
+        let known = self.names.iter().position(|known| known == name);
+        known.or_else(|| {
+            self.listener.knows(name).then(|| {
+                self.names.push(name.to_owned());
+                self.names.len() - 1
+            })
+        })
+    }
+
     /// `Signal == text`, either way round; `None` if neither side is a text.
     fn text_comparison(&mut self, left: &Node, right: &Node) -> Result<Option<Expression>, Fault> {
         for (signal, text) in [(left, right), (right, left)] {
@@ -313,11 +473,17 @@ impl Binder<'_> {
                 _ => continue,
             };
             let Kind::Name(name) = &signal.kind else { continue };
-            let Some(slot) = self.slot(name) else { continue };
+            let slot = self.slot(name);
+            let said = if slot.is_none() && part(name).is_none() { self.said(name) } else { None };
             // Without quotes it may also be another signal, or nothing at all.
-            if !quoted && (self.slot(wanted).is_some() || part(wanted).is_some()) {
+            let is_value =
+                self.slot(wanted).is_some() || part(wanted).is_some() || self.said(wanted).is_some();
+            if slot.is_none() && said.is_none() || !quoted && is_value {
                 continue;
             }
+            let Some(slot) = slot else {
+                return Ok(said.map(|said| Expression::SaidText(said, wanted.clone())));
+            };
             let decoder = self.decoder;
             let signals = self.slots[slot].candidates.iter();
             let signals = signals.map(|&(message, index)| &decoder.message(message).signals[index as usize]);

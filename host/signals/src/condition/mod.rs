@@ -8,6 +8,7 @@
 //! | `ext`, `rtr` | 1 for a 29-bit identifier, for a remote frame |
 //! | `byte[0]` | a data byte, counted from 0 |
 //! | `error`, `lost` | 1 for a bus error, for a place where frames are missing |
+//! | `uds.sid`, `j1939.pgn` | a value of what several frames say together, where a [`Listener`] puts them together |
 //! | `12`, `0x1F`, `0b101`, `1.5e3` | numbers |
 //! | `+ - * / % & \|`, `== != < <= > >=`, `not and or`, `( )` | as usual; `&` and `\|` bind tighter than comparisons |
 //!
@@ -16,7 +17,9 @@
 
 mod bind;
 mod error;
+mod listener;
 mod syntax;
 
 pub use bind::Condition;
 pub use error::{ConditionError, ConditionFault};
+pub use listener::{Listener, Said};

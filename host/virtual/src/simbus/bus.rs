@@ -60,6 +60,8 @@ pub struct SimBus {
     disturbed: u32,
     random: fastrand::Rng,
     phase: Phase,
+    /// Since then nobody listens, and the simulated nodes are silent.
+    silent_from_ns: Option<u64>,
     /// Somebody watches the level, which no controller needs to be on the bus for.
     watched: bool,
     waveform: Waveform,
@@ -76,6 +78,7 @@ impl SimBus {
             disturbed: 0,
             random: fastrand::Rng::with_seed(seed),
             phase: Phase::Free { from_ns: 0 },
+            silent_from_ns: None,
             watched: false,
             waveform: Waveform::default(),
         }
@@ -118,7 +121,13 @@ impl SimBus {
         match self.phase {
             Phase::Busy { end_ns, .. } => end_ns,
             Phase::Free { from_ns } => {
-                let Some(bitrate_bps) = self.rate(nodes) else { return NEVER };
+                let Some(bitrate_bps) = self.rate(nodes) else {
+                    self.silent_from_ns.get_or_insert(now_ns);
+                    return NEVER;
+                };
+                if let Some(from_ns) = self.silent_from_ns.take() {
+                    self.traffic.postpone(now_ns.saturating_sub(from_ns));
+                }
                 if nodes.iter().any(|node| node.bid().is_some()) {
                     return from_ns.max(now_ns);
                 }
@@ -361,6 +370,36 @@ mod tests {
         let bits: u64 = node.seen.iter().map(|(frame, _)| u64::from(FrameBits::of(frame).total())).sum();
         let percent = bits as f64 / 5_000_000.0 * 100.0;
         assert!((percent - 37.0).abs() < 0.01, "{percent} %");
+    }
+
+    /// What had been due meanwhile came back to back, so that a bus of 30 % was one of 100 % for as long as it had slept.
+    #[test]
+    fn who_comes_back_after_a_while_finds_the_bus_as_it_was() {
+        let traffic = [
+            load(Frames::Mix, 37.0),
+            Traffic::new(Schedule::Bursts {
+                source: FrameSource::new(Frames::Std8, 1),
+                length: 3,
+                period_ns: 10_000_000,
+            }),
+        ];
+        for traffic in traffic {
+            let mut bus = SimBus::new(Some(500_000), traffic, 1);
+            let mut node = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
+            run(&mut bus, 1_000_000_000, &mut [&mut node]);
+            let before = node.seen.len();
+            assert_eq!(bus.next_event_ns(1_000_000_000, &[]), NEVER);
+            assert_eq!(bus.next_event_ns(5_000_000_000, &[]), NEVER);
+            let mut now_ns = 8_000_000_000;
+            let mut again = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
+            while now_ns < 9_000_000_000 {
+                let mut nodes: [&mut dyn Node; 1] = [&mut again];
+                now_ns = bus.next_event_ns(now_ns, &nodes);
+                bus.step(now_ns, &mut nodes);
+            }
+            let after = again.seen.len();
+            assert!(after.abs_diff(before) < before / 20, "{before} {after}");
+        }
     }
 
     #[test]

@@ -110,6 +110,15 @@ impl Traffic {
         self.next
     }
 
+    /// Nobody listened for so long, and nobody sent: what was planned comes so much later, and not all at once.
+    pub fn postpone(&mut self, by_ns: u64) {
+        self.start_ns += by_ns;
+        self.due_ns += by_ns as f64;
+        for (due_ns, _) in self.next.iter_mut().chain(&mut self.waiting) {
+            *due_ns += by_ns;
+        }
+    }
+
     /// The frame is on the bus.
     pub fn take(&mut self, now_ns: u64) {
         self.next = None;

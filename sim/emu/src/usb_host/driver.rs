@@ -74,6 +74,8 @@ pub struct Driver {
     lines_sent: bool,
     coding_set: bool,
     port_open: bool,
+    /// A new configuration leaves the port to whoever has it open, and nobody is told.
+    pub(super) keeps_port: bool,
     /// The device has a configuration, and the driver its interfaces.
     bound: bool,
     /// A bulk pipe that was found halted, by its address.
@@ -120,6 +122,7 @@ impl Driver {
             lines_sent: false,
             coding_set: false,
             port_open: false,
+            keeps_port: false,
             bound: false,
             stalled: None,
             in_data1: false,
@@ -191,6 +194,7 @@ impl HostDriver for Driver {
             identity: self.identity.take(),
             input: std::mem::take(&mut self.input),
             reading: self.reading,
+            keeps_port: self.keeps_port,
             outcomes: std::mem::take(&mut self.outcomes),
             enumerations: self.enumerations,
             ..Self::new()

@@ -231,6 +231,11 @@ impl UsbHost {
         self.driver.reading = reading;
     }
 
+    /// Whether a new configuration leaves the port to whoever has it open, who is told nothing. Otherwise the driver opens it again.
+    pub fn keep_port(&mut self, keep: bool) {
+        self.driver.keeps_port = keep;
+    }
+
     /// Queues bytes for the device.
     pub fn send(&mut self, bytes: &[u8]) {
         self.driver.output.extend(bytes);

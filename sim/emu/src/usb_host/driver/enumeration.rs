@@ -191,17 +191,19 @@ impl Driver {
     }
 
     /// What a request that was carried out means for the host's side of the pipes: where the device begins with DATA0, so does the
-    /// host (USB 2.0, 9.1.1.5 and 9.4.5), and a configuration takes the port from whoever had it open.
+    /// host (USB 2.0, 9.1.1.5 and 9.4.5), and a configuration takes the port from whoever had it open, unless the driver keeps it.
     fn follow(&mut self, request: &Request) {
         let Some(acm) = self.acm else { return };
         match (request.kind, request.request) {
             (TO_DEVICE, SET_CONFIGURATION) => {
                 (self.in_data1, self.out_data1, self.notify_data1) = (false, false, false);
                 self.bound = request.value != 0;
-                self.port_open = false;
                 self.stalled = None;
                 self.partial.clear();
-                self.output.clear();
+                if !self.keeps_port {
+                    self.port_open = false;
+                    self.output.clear();
+                }
             }
             (0x01, SET_INTERFACE) if request.index == u16::from(acm.data_interface) => {
                 (self.in_data1, self.out_data1) = (false, false);

@@ -1,7 +1,7 @@
 //! The first records show what a bus speaks. They wait meanwhile, and are then read like all others.
 
 use cantap::TraceRecord;
-use cantap_protocols::{Evidence, Survey};
+use cantap_protocols::{Evidence, Relative, Survey};
 
 /// No survey looks at more records than this.
 const MOST_RECORDS: usize = 200_000;
@@ -20,16 +20,16 @@ impl Surveyed {
         Self { survey: is_wanted.then(Survey::new), waiting: Vec::new() }
     }
 
-    /// Takes the records and leaves none; whether the survey is done.
-    pub fn take(&mut self, records: &mut Vec<TraceRecord>, more: bool) -> bool {
+    /// Takes records; whether the survey is done.
+    pub fn take(&mut self, records: &[TraceRecord], more: bool) -> bool {
         let Some(survey) = &mut self.survey else {
-            self.waiting.append(records);
+            self.waiting.extend_from_slice(records);
             return true;
         };
-        for record in records.iter() {
+        for record in records {
             survey.take(record);
         }
-        self.waiting.append(records);
+        self.waiting.extend_from_slice(records);
         let spans = match (self.waiting.first(), self.waiting.last()) {
             (Some(first), Some(last)) => last.time_ns.saturating_sub(first.time_ns),
             _ => 0,
@@ -42,6 +42,11 @@ impl Surveyed {
         self.survey.as_ref().map(Survey::found)
     }
 
+    /// What is recognised and not read.
+    pub fn relatives(&self) -> Vec<(u8, Relative)> {
+        self.survey.as_ref().map_or_else(Vec::new, Survey::relatives)
+    }
+
     /// The records that waited.
     pub fn release(&mut self) -> Vec<TraceRecord> {
         std::mem::take(&mut self.waiting)
@@ -49,9 +54,12 @@ impl Surveyed {
 }
 
 /// Says what was found.
-pub(super) fn tell(found: Option<&[Evidence]>) {
+pub(super) fn tell(found: Option<&[Evidence]>, relatives: &[(u8, Relative)]) {
     let Some(found) = found else { return };
-    if found.is_empty() {
+    for (channel, relative) in relatives {
+        eprintln!("cantap: channel {channel} has {relative}, which is recognised and not read");
+    }
+    if found.is_empty() && relatives.is_empty() {
         eprintln!(
             "cantap: no protocol is known by its first frames; name one with --protocol to read the trace by it"
         );

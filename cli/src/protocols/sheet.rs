@@ -10,7 +10,7 @@ use cantap_protocols::canopen::eds::Eds;
 
 /// A sheet's file and its node.
 #[derive(Clone, Debug)]
-pub(super) struct SheetPath {
+pub struct SheetPath {
     node: Option<u8>,
     path: PathBuf,
 }

@@ -1,0 +1,197 @@
+//! `cantap bridge`: a device's channels as CAN interfaces of Linux, for every program that knows SocketCAN.
+
+mod frames;
+mod interface;
+mod lane;
+mod sender;
+#[cfg(test)]
+mod tests;
+
+use std::borrow::Borrow;
+use std::process::ExitCode;
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, Mutex, PoisonError, Weak};
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, anyhow};
+use cantap::Device;
+use cantap::device::{Happening, Reconnecting};
+use cantap::wire::Channel;
+use cantap::wire::message::Mode;
+
+use self::interface::CanPort;
+use self::lane::Lane;
+use self::sender::Sender;
+use crate::address::OpenDevice;
+use crate::boards::OneBoard;
+use crate::channel_args::ChannelArgs;
+use crate::hearing::{self, Hearing};
+use crate::wrong::wrong;
+use crate::{advice, args, interrupt, live, stderr};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "The interfaces are virtual ones, which root makes once:\n  \
+                  ip link add can0 type vcan && ip link set can0 up\n\n\
+                  Channels only listen, unless --mode says otherwise: what programs write is refused then, with an error frame for each. What \
+                  the buses\nrefuse, errors, states and losses are error frames (candump -e shows them). A frame's time is that of its arrival at the \
+                  interface.\n\n\
+                  Examples:\n  cantap bridge -d /dev/ttyACM0 -b 500k can0 can1\n  \
+                  cantap bridge -d /dev/ttyACM0 -b 500k --mode normal can0\n  \
+                  cantap bridge -d unix: 2:can1")]
+pub struct Args {
+    #[command(flatten)]
+    board: OneBoard,
+    /// Interfaces: the first is channel 1's, the second channel 2's, unless a channel stands before it (2:can1).
+    #[arg(required = true, num_args = 1..=2, value_name = "[CHANNEL:]INTERFACE")]
+    interfaces: Vec<String>,
+    #[command(flatten)]
+    open: ChannelArgs,
+}
+
+/// How often to check whether to go on while nothing arrives.
+const LOOK_EVERY: Duration = Duration::from_millis(50);
+
+/// A device that both directions use.
+struct Handle(Arc<OpenDevice>);
+
+impl Borrow<Device> for Handle {
+    fn borrow(&self) -> &Device {
+        &self.0
+    }
+}
+
+/// Which interface is which channel's.
+fn places(interfaces: &[String]) -> anyhow::Result<Vec<(Channel, &str)>> {
+    let mut places: Vec<(Channel, &str)> = Vec::new();
+    for (text, usual) in interfaces.iter().zip(Channel::ALL) {
+        let (channel, name) = match text.split_once(':') {
+            Some((channel, name)) => (args::channel(channel).map_err(wrong)?, name),
+            None => (usual, text.as_str()),
+        };
+        if places.iter().any(|(taken, other)| *taken == channel || *other == name) {
+            return Err(wrong(format!("'{text}' is given twice: one interface for each channel")));
+        }
+        places.push((channel, name));
+    }
+    Ok(places)
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let places = places(&args.interfaces)?;
+    args.open.timing.check_channels(1)?;
+    let address = args.board.address()?;
+    let lanes = places.iter().map(|(channel, name)| {
+        let (port, known) = CanPort::open(name)?;
+        Ok(Lane::new(*channel, name, Box::new(port), known))
+    });
+    let lanes: Arc<[Lane]> = lanes.collect::<anyhow::Result<_>>()?;
+    let channels: Vec<Channel> = places.iter().map(|(channel, _)| *channel).collect();
+    let latest = Arc::new(Mutex::new(Weak::new()));
+    let (at, connected) = (address.clone(), Arc::clone(&latest));
+    let connect = move |serial: Option<&str>| {
+        let device = Arc::new(at.open_again(serial)?);
+        *connected.lock().unwrap_or_else(PoisonError::into_inner) = Arc::downgrade(&device);
+        Ok(Handle(device))
+    };
+    let open = args.open.clone();
+    let setup = move |handle: &Handle| {
+        open.open(&handle.0, channels.iter().copied(), Mode::ListenOnly, Some(&[])).map(|_| ())
+    };
+    let mut line: Reconnecting<Handle, anyhow::Error> =
+        Reconnecting::new(&address.to_string(), connect, setup);
+    line.connect()?;
+    interrupt::watch()?;
+    let sender = Sender::start(Arc::clone(&lanes)).context("the system refused a thread")?;
+    let device = || latest.lock().unwrap_or_else(PoisonError::into_inner).upgrade();
+    sender.use_device(device());
+    for lane in lanes.iter() {
+        eprintln!("cantap: {}", begun(lane, device().as_deref()));
+    }
+    let mut bridge = Bridge { lanes: &lanes, hearing: Hearing::default(), address: address.to_string() };
+    let mut rescue = args.open.rescue();
+    loop {
+        if interrupt::requested() {
+            sender.use_device(None);
+            break;
+        }
+        if let Some(reason) = sender.failed() {
+            return Err(anyhow!("an interface is gone: {reason}"));
+        }
+        match line.next(LOOK_EVERY) {
+            Happening::Records(records) => {
+                bridge.hear(&records)?;
+                line.recycle(records);
+            }
+            Happening::Gone(error) => {
+                sender.use_device(None);
+                let reason = advice::sentence(&error);
+                if !address.may_come_back() {
+                    return Err(error);
+                }
+                eprintln!("cantap: {reason}; it goes on when the device is back, and Ctrl-C ends it");
+            }
+            Happening::Back(back) => {
+                sender.use_device(device());
+                eprintln!("cantap: {}", live::welcome(0, None, &back));
+            }
+            Happening::Ended => break,
+        }
+        match line.device().map(|device| rescue.look(device)) {
+            // The stream tells.
+            Some(Err(error)) if !error.is_of_the_connection() => return Err(error.into()),
+            _ => {}
+        }
+    }
+    drop(sender);
+    let stopped = line.stop();
+    while let Happening::Records(records) = line.next(LOOK_EVERY) {
+        bridge.hear(&records)?;
+    }
+    for lane in lanes.iter() {
+        eprintln!("cantap: {}", ended(lane));
+    }
+    stopped.map(|()| ExitCode::SUCCESS)
+}
+
+/// The way from the buses to programs.
+struct Bridge<'l> {
+    lanes: &'l [Lane],
+    hearing: Hearing,
+    address: String,
+}
+
+impl Bridge<'_> {
+    fn hear(&mut self, records: &[cantap::TraceRecord]) -> anyhow::Result<()> {
+        for lane in self.lanes {
+            lane.hear(records).with_context(|| format!("the interface '{}' is gone", lane.name))?;
+        }
+        let now = Instant::now();
+        self.hearing.take(records, now);
+        for number in self.hearing.news(now) {
+            stderr::warn(&hearing::meaning(number, &self.address, number));
+        }
+        Ok(())
+    }
+}
+
+/// What a user is told of a channel at its beginning.
+fn begun(lane: &Lane, device: Option<&OpenDevice>) -> String {
+    let opened = device.map(|device| device.open_channels()).unwrap_or_default();
+    let config = opened.iter().find(|(channel, _)| *channel == lane.channel).map(|(_, config)| config);
+    let listens = config.is_none_or(|config| config.mode == Mode::ListenOnly);
+    let may = if listens { "programs may listen" } else { "programs may listen and send" };
+    format!("channel {} is at {}; {may}; Ctrl-C ends it", lane.channel.number(), lane.name)
+}
+
+/// And at its end.
+fn ended(lane: &Lane) -> String {
+    let [heard, sent, not_sent, undelivered] =
+        [&lane.counts.heard, &lane.counts.sent, &lane.counts.not_sent, &lane.counts.undelivered]
+            .map(|count| count.load(Ordering::Relaxed));
+    format!(
+        "{}: {heard} frames heard, {undelivered} not taken by the interface; {sent} sent, {not_sent} not sent",
+        lane.name
+    )
+}

@@ -1,0 +1,120 @@
+//! What crosses a raw CAN socket: `struct can_frame` of Linux (`linux/can.h`), 16 bytes, and what it is here.
+
+use cantap::TraceEvent;
+use cantap::wire::{Frame, Id};
+use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
+
+/// The identifier with its flags in the machine's byte order, the length, two unused bytes, the DLC where it is above 8, the data.
+pub type RawFrame = [u8; 16];
+
+const EXTENDED_FLAG: u32 = 0x8000_0000;
+const REMOTE_FLAG: u32 = 0x4000_0000;
+/// Places in a raw frame.
+const LEN: usize = 4;
+const DLC_ABOVE_8: usize = 7;
+const DATA: usize = 8;
+
+/// A frame for programs.
+pub fn raw_frame(frame: &Frame) -> RawFrame {
+    let extended = if frame.id().is_extended() { EXTENDED_FLAG } else { 0 };
+    let remote = if frame.is_remote() { REMOTE_FLAG } else { 0 };
+    let mut raw = raw(frame.id().raw() | extended | remote, frame.padded_data());
+    raw[LEN] = frame.dlc().min(8);
+    if frame.dlc() > 8 {
+        raw[DLC_ABOVE_8] = frame.dlc();
+    }
+    raw
+}
+
+/// An error, a state or a loss for programs; nothing for a frame.
+pub fn raw_error(event: &TraceEvent) -> Option<RawFrame> {
+    let ErrorFrame { classes, data } = ErrorFrame::of(event)?;
+    let mut raw = raw(ERROR_FLAG | classes, data);
+    raw[LEN] = 8;
+    Some(raw)
+}
+
+fn raw(id: u32, data: [u8; 8]) -> RawFrame {
+    let mut raw = [0; 16];
+    raw[..LEN].copy_from_slice(&id.to_ne_bytes());
+    raw[DATA..].copy_from_slice(&data);
+    raw
+}
+
+/// A program's frame; nothing if it is none that a bus carries: an error frame, or one of more than eight bytes.
+pub fn frame_of(raw: &RawFrame) -> Option<Frame> {
+    let [a, b, c, d, len, _, _, above_8, data @ ..] = *raw;
+    let id = u32::from_ne_bytes([a, b, c, d]);
+    if id & ERROR_FLAG != 0 || len > 8 {
+        return None;
+    }
+    let is_remote = id & REMOTE_FLAG != 0;
+    let id = if id & EXTENDED_FLAG != 0 {
+        Id::extended(id & Id::MAX_EXTENDED)?
+    } else {
+        Id::standard(id & Id::MAX_STANDARD)?
+    };
+    let dlc = if len == 8 && (9..=15).contains(&above_8) { above_8 } else { len };
+    Some(Frame::from_bus(id, is_remote, dlc, data))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap::wire::record::{ErrorState, LossStage};
+
+    fn bytes(id: u32, rest: [u8; 12]) -> RawFrame {
+        let mut raw = [0; 16];
+        raw[..4].copy_from_slice(&id.to_ne_bytes());
+        raw[4..].copy_from_slice(&rest);
+        raw
+    }
+
+    #[test]
+    fn frames_are_can_frames_of_linux_and_come_back_as_they_were() {
+        for (text, raw) in [
+            ("123#1122", bytes(0x123, [2, 0, 0, 0, 0x11, 0x22, 0, 0, 0, 0, 0, 0])),
+            ("123#", bytes(0x123, [0; 12])),
+            ("1ABBCCDD#FF", bytes(0x9ABB_CCDD, [1, 0, 0, 0, 0xFF, 0, 0, 0, 0, 0, 0, 0])),
+            ("7FF#R4", bytes(0x4000_07FF, [4, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])),
+            ("00000123#R", bytes(0xC000_0123, [0; 12])),
+        ] {
+            let frame: Frame = text.parse().unwrap();
+            assert_eq!(raw_frame(&frame), raw, "{text}");
+            assert_eq!(frame_of(&raw), Some(frame), "{text}");
+        }
+        for dlc in 0..16 {
+            for is_remote in [false, true] {
+                let frame = Frame::from_bus(Id::standard(1).unwrap(), is_remote, dlc, [7; 8]);
+                assert_eq!(frame_of(&raw_frame(&frame)), Some(frame), "{dlc}");
+            }
+        }
+    }
+
+    /// What programs write beyond the length, and where nothing belongs, goes nowhere.
+    #[test]
+    fn what_no_bus_carries_is_no_frame_and_bytes_beyond_the_length_are_left_out() {
+        let beyond = bytes(0x123, [1, 9, 9, 9, 0x11, 9, 9, 9, 9, 9, 9, 9]);
+        assert_eq!(frame_of(&beyond), Some("123#11".parse().unwrap()));
+        assert_eq!(frame_of(&bytes(0x2000_0001, [8, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])), None);
+        assert_eq!(frame_of(&bytes(0x123, [9, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0])), None);
+    }
+
+    #[test]
+    fn errors_states_and_losses_are_error_frames_that_say_the_same() {
+        for event in [
+            TraceEvent::State { state: ErrorState::BusOff, counters: Some((255, 1)) },
+            TraceEvent::BusError { kind: None, counters: None },
+            TraceEvent::Lost { stage: Some(LossStage::Queue), count: 77, at_least: false },
+        ] {
+            let raw = raw_error(&event).unwrap();
+            let id = u32::from_ne_bytes([raw[0], raw[1], raw[2], raw[3]]);
+            assert_eq!((id & ERROR_FLAG, raw[4]), (ERROR_FLAG, 8));
+            let data = std::array::from_fn(|at| raw[8 + at]);
+            assert_eq!(ErrorFrame { classes: id & !ERROR_FLAG, data }.events(), (event, None));
+        }
+        let frame = cantap::TraceFrame::from("123#".parse::<Frame>().unwrap());
+        let heard = TraceEvent::Frame { frame, direction: cantap::Direction::Rx, late: false };
+        assert_eq!(raw_error(&heard), None);
+    }
+}

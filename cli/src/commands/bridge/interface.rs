@@ -1,0 +1,223 @@
+//! A CAN interface of Linux, by its raw socket: many frames with each system call.
+
+use std::io::{self, IoSlice, IoSliceMut};
+use std::os::fd::{AsFd, AsRawFd, BorrowedFd};
+use std::path::Path;
+use std::time::Duration;
+
+use anyhow::{Context, bail};
+use nix::errno::Errno;
+use nix::sys::socket::{
+    ControlMessageOwned, MsgFlags, MultiHeaders, recvmmsg, sendmmsg, setsockopt, sockopt,
+};
+use socketcan::{CanSocket, Socket, SocketOptions};
+
+use super::frames::RawFrame;
+
+/// Frames of one system call.
+pub const BATCH: usize = 64;
+/// So often a full socket is tried again, a millisecond apart.
+const TRIES: u32 = 200;
+/// Where the kernel tells of its network interfaces.
+const NETWORK: &str = "/sys/class/net";
+/// ARPHRD_CAN of `linux/if_arp.h`.
+const TYPE_OF_CAN: &str = "280";
+/// Of `linux/if.h`.
+const IFF_UP: u32 = 1;
+const IFF_ECHO: u32 = 1 << 18;
+/// What controllers' interfaces queue (`linux/can/dev.h`'s users); virtual ones have none of their own, which the kernel makes 1000.
+const QUEUE_OF_CONTROLLERS: &str = "10";
+
+/// Where frames go to and come from. A trait, because no CAN socket can be had where tests run.
+pub trait Port: Send + Sync {
+    /// Adds frames that programs have written, at most so many, without waiting. Returns how many the kernel has thrown away so far
+    /// because nobody took them.
+    fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32>;
+    /// Hands frames to programs. Returns how many were taken; an error if none was.
+    fn send(&self, frames: &[RawFrame]) -> io::Result<usize>;
+    /// What can be waited for.
+    fn as_fd(&self) -> Option<BorrowedFd<'_>>;
+}
+
+/// An interface that is open.
+pub struct CanPort(CanSocket);
+
+/// What is known of an interface before it is opened.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Known {
+    /// Who sends on it is not shown its own frame by the kernel, so that a confirmation can be the echo.
+    pub echoes: bool,
+}
+
+impl CanPort {
+    /// Opens an interface, which must be virtual, and up. The error says the line that makes it so.
+    pub fn open(name: &str) -> anyhow::Result<(Self, Known)> {
+        let known = look(Path::new(NETWORK), name)?;
+        let opened = || -> io::Result<CanSocket> {
+            let socket = CanSocket::open(name)?;
+            // Errors of this interface would be our own.
+            socket.set_error_filter_drop_all()?;
+            socket.set_loopback(true)?;
+            socket.set_recv_own_msgs(false)?;
+            setsockopt(&socket, sockopt::RxqOvfl, &1)?;
+            Ok(socket)
+        };
+        let socket = opened().with_context(|| format!("the interface '{name}' cannot be opened"))?;
+        // As much as any user may have: what programs write waits here while the bus is busy.
+        let _ = setsockopt(&socket, sockopt::RcvBuf, &(8 << 20));
+        Ok((Self(socket), known))
+    }
+}
+
+/// Whether an interface can be bridged, and how it echoes.
+fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
+    let folder = network.join(name);
+    let read = |file: &str| {
+        let text = std::fs::read_to_string(folder.join(file)).unwrap_or_default();
+        text.trim().to_owned()
+    };
+    if name.is_empty() || name.contains('/') || !folder.exists() {
+        bail!(
+            "there is no interface '{name}'; as root: ip link add {name} type vcan && ip link set {name} up"
+        );
+    }
+    if read("type") != TYPE_OF_CAN {
+        bail!("'{name}' is no CAN interface; as root: ip link add can0 type vcan && ip link set can0 up");
+    }
+    let flags = u32::from_str_radix(read("flags").trim_start_matches("0x"), 16).unwrap_or(0);
+    // Ends of a vxcan pair name each other.
+    let is_pair = read("iflink") != read("ifindex");
+    let is_virtual =
+        folder.canonicalize().is_ok_and(|path| path.components().any(|part| part.as_os_str() == "virtual"));
+    let has_controller = flags & IFF_ECHO != 0 && !is_pair && read("tx_queue_len") == QUEUE_OF_CONTROLLERS;
+    if !is_virtual || has_controller {
+        bail!(
+            "'{name}' belongs to a CAN controller, which would send on its bus what is heard here; bridge to a virtual one, as \
+             root: ip link add vcan0 type vcan && ip link set vcan0 up"
+        );
+    }
+    if flags & IFF_UP == 0 {
+        bail!("the interface '{name}' is down; as root: ip link set {name} up");
+    }
+    // vcan shows each frame to the other programs as it is written; so do pairs of newer kernels, which do not claim that their driver
+    // does.
+    Ok(Known { echoes: is_pair && flags & IFF_ECHO != 0 })
+}
+
+impl Port for CanPort {
+    fn receive(&self, most: usize, frames: &mut Vec<RawFrame>) -> io::Result<u32> {
+        let mut headers = MultiHeaders::<()>::preallocate(most.min(BATCH), Some(nix::cmsg_space!(u32)));
+        let mut buffers = vec![[0; 16]; most.min(BATCH)];
+        let mut lens = Vec::with_capacity(buffers.len());
+        let mut thrown_away = 0;
+        {
+            let mut slices: Vec<[IoSliceMut<'_>; 1]> =
+                buffers.iter_mut().map(|buffer| [IoSliceMut::new(buffer)]).collect();
+            let taken =
+                recvmmsg(self.0.as_raw_fd(), &mut headers, slices.iter_mut(), MsgFlags::MSG_DONTWAIT, None);
+            match taken {
+                Ok(messages) => {
+                    for message in messages {
+                        lens.push(message.bytes);
+                        for control in message.cmsgs().into_iter().flatten() {
+                            if let ControlMessageOwned::RxqOvfl(count) = control {
+                                thrown_away = count;
+                            }
+                        }
+                    }
+                }
+                // One that is down may come up again.
+                Err(Errno::EAGAIN | Errno::EINTR | Errno::ENETDOWN) => {}
+                Err(error) => return Err(error.into()),
+            }
+        }
+        let whole = buffers.iter().zip(lens).filter(|(_, len)| *len == size_of::<RawFrame>());
+        frames.extend(whole.map(|(buffer, _)| *buffer));
+        Ok(thrown_away)
+    }
+
+    fn send(&self, frames: &[RawFrame]) -> io::Result<usize> {
+        let mut headers = MultiHeaders::<()>::preallocate(BATCH, None);
+        let mut sent = 0;
+        let mut tries = 0;
+        while sent < frames.len() {
+            let rest = &frames[sent..frames.len().min(sent + BATCH)];
+            let slices: Vec<[IoSlice<'_>; 1]> = rest.iter().map(|frame| [IoSlice::new(frame)]).collect();
+            let taken = sendmmsg(
+                self.0.as_raw_fd(),
+                &mut headers,
+                slices.iter(),
+                [None; BATCH],
+                [],
+                MsgFlags::MSG_DONTWAIT,
+            );
+            match taken.map(Iterator::count) {
+                Ok(count) => {
+                    sent += count;
+                    tries = 0;
+                }
+                Err(Errno::EINTR) => {}
+                Err(Errno::EAGAIN | Errno::ENOBUFS) if tries < TRIES => {
+                    tries += 1;
+                    std::thread::sleep(Duration::from_millis(1));
+                }
+                Err(_) if sent > 0 => return Ok(sent),
+                Err(error) => return Err(error.into()),
+            }
+        }
+        Ok(sent)
+    }
+
+    fn as_fd(&self) -> Option<BorrowedFd<'_>> {
+        Some(self.0.as_fd())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// An interface as the kernel shows it.
+    fn interface(network: &Path, place: &str, name: &str, files: [(&str, &str); 5]) {
+        let folder = network.join("devices").join(place).join("net").join(name);
+        std::fs::create_dir_all(&folder).unwrap();
+        for (file, text) in files {
+            std::fs::write(folder.join(file), format!("{text}\n")).unwrap();
+        }
+        std::os::unix::fs::symlink(folder, network.join(name)).unwrap();
+    }
+
+    #[test]
+    fn only_virtual_can_interfaces_that_are_up_are_bridged_and_the_error_says_what_root_must_run() {
+        let folder = tempfile::tempdir().unwrap();
+        let files = |kind, flags, index, link, queue| {
+            [("type", kind), ("flags", flags), ("ifindex", index), ("iflink", link), ("tx_queue_len", queue)]
+        };
+        for (place, name, files) in [
+            ("virtual", "vcan0", files("280", "0xc1", "4", "4", "1000")),
+            ("virtual", "old", files("280", "0x400c1", "5", "6", "1000")),
+            ("virtual", "new", files("280", "0xc1", "7", "8", "1000")),
+            ("virtual", "down", files("280", "0x80", "9", "9", "1000")),
+            ("virtual", "slcan0", files("280", "0x400c1", "10", "10", "10")),
+            ("pci0", "can0", files("280", "0x400c1", "11", "11", "10")),
+            ("virtual", "lo", files("772", "0x9", "1", "1", "1000")),
+        ] {
+            interface(folder.path(), place, name, files);
+        }
+        let look = |name| look(folder.path(), name).map_err(|error| error.to_string());
+        assert_eq!(look("vcan0"), Ok(Known { echoes: false }));
+        assert_eq!(look("new"), Ok(Known { echoes: false }));
+        assert_eq!(look("old"), Ok(Known { echoes: true }));
+        for (name, part) in [
+            ("can7", "ip link add can7 type vcan && ip link set can7 up"),
+            ("down", "ip link set down up"),
+            ("slcan0", "belongs to a CAN controller"),
+            ("can0", "belongs to a CAN controller"),
+            ("lo", "no CAN interface"),
+            ("../x", "no interface"),
+        ] {
+            let error = look(name).unwrap_err();
+            assert!(error.contains(part), "{name}: {error}");
+        }
+    }
+}

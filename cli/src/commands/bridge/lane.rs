@@ -1,0 +1,194 @@
+//! One channel and its interface: what both directions share.
+
+use std::collections::VecDeque;
+use std::io;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use cantap::device::channel_number;
+use cantap::wire::record::{LossStage, TransmitFailure};
+use cantap::wire::{Channel, Frame};
+use cantap::{Direction, TraceEvent, TraceRecord};
+
+use super::frames::{RawFrame, raw_error, raw_frame};
+use super::interface::{Known, Port};
+use crate::stderr;
+
+/// A channel and its interface.
+pub struct Lane {
+    pub channel: Channel,
+    pub name: String,
+    pub port: Box<dyn Port>,
+    known: Known,
+    /// Programs' frames that are on their way to the bus.
+    own: Mutex<VecDeque<Frame>>,
+    /// Frames and errors that the interface did not take, and nobody was told of yet.
+    missing: Mutex<u32>,
+    /// It has been said that frames are not sent because the channel only listens.
+    told_refusal: AtomicBool,
+    pub counts: Counts,
+}
+
+/// What went which way.
+#[derive(Default)]
+pub struct Counts {
+    /// Frames that programs were given.
+    pub heard: AtomicU64,
+    /// Programs' frames that were on the bus.
+    pub sent: AtomicU64,
+    /// Programs' frames that were not, or of which nobody knows.
+    pub not_sent: AtomicU64,
+    /// Frames that the interface did not take.
+    pub undelivered: AtomicU64,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    // Every holder leaves the state whole.
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+fn add(count: &AtomicU64, number: usize) {
+    count.fetch_add(number as u64, Ordering::Relaxed);
+}
+
+impl Lane {
+    pub fn new(channel: Channel, name: &str, port: Box<dyn Port>, known: Known) -> Self {
+        Self {
+            channel,
+            name: name.to_owned(),
+            port,
+            known,
+            own: Mutex::default(),
+            missing: Mutex::new(0),
+            told_refusal: AtomicBool::new(false),
+            counts: Counts::default(),
+        }
+    }
+
+    /// A program's frame is on its way.
+    pub fn sends(&self, frame: Frame) {
+        lock(&self.own).push_back(frame);
+    }
+
+    /// It is not any more. Returns whether it was.
+    pub fn has_ended(&self, frame: &Frame) -> bool {
+        let mut own = lock(&self.own);
+        let at = own.iter().position(|own| own == frame);
+        at.is_some_and(|at| own.remove(at).is_some())
+    }
+
+    /// Counts a program's frame that was on the bus.
+    pub fn count_sent(&self) {
+        add(&self.counts.sent, 1);
+    }
+
+    /// Counts one that was not, which programs are told of otherwise.
+    pub fn count_not_sent(&self) {
+        add(&self.counts.not_sent, 1);
+    }
+
+    /// Hands programs what was heard of this channel.
+    pub fn hear(&self, records: &[TraceRecord]) -> io::Result<()> {
+        let number = channel_number(0, self.channel);
+        let mut raw = Vec::new();
+        let mut frames = 0;
+        for record in records.iter().filter(|record| record.channel == number) {
+            match &record.event {
+                TraceEvent::Frame { frame, direction, .. } => {
+                    let Some(frame) = frame.classic() else { continue };
+                    // Where the kernel has shown it to the others already, once is enough.
+                    if *direction == Direction::Tx && self.has_ended(frame) && !self.known.echoes {
+                        continue;
+                    }
+                    frames += 1;
+                    raw.push(raw_frame(frame));
+                }
+                event => {
+                    if matches!(event, TraceEvent::Lost { .. }) {
+                        // A confirmation may be among what is lost, and what it was for is not waited for for ever.
+                        lock(&self.own).clear();
+                    }
+                    raw.extend(raw_error(event));
+                }
+            }
+        }
+        let delivered = self.deliver(raw)?;
+        if delivered {
+            add(&self.counts.heard, frames);
+        }
+        Ok(())
+    }
+
+    /// A program's frames are not sent, or nobody knows whether they were: it is told by an error frame for each.
+    pub fn refuse(&self, number: usize) -> io::Result<()> {
+        add(&self.counts.not_sent, number);
+        let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
+        self.deliver(vec![raw_error(&failed).unwrap_or_default(); number]).map(|_| ())
+    }
+
+    /// The same, because the channel only listens, which is said once.
+    pub fn refuse_listening(&self, number: usize) -> io::Result<()> {
+        if !self.told_refusal.swap(true, Ordering::Relaxed) {
+            stderr::warn(&format!(
+                "a program writes to {}, and channel {} only listens: nothing is sent; --mode normal lets programs send",
+                self.name,
+                channel_number(0, self.channel)
+            ));
+        }
+        self.refuse(number)
+    }
+
+    /// Counts frames that programs wrote and the kernel threw away before they were read.
+    pub fn overflowed(&self, number: u32) -> io::Result<()> {
+        stderr::warn(&format!(
+            "{} takes frames faster than its bus: {number} were not sent, because the socket was full",
+            self.name
+        ));
+        add(&self.counts.not_sent, number as usize);
+        let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
+        self.deliver(vec![raw_error(&failed).unwrap_or_default()]).map(|_| ())
+    }
+
+    /// Hands programs raw frames. What the interface does not take is counted, and told in place when it takes some again. Returns
+    /// whether all were taken; an error if the interface is gone.
+    fn deliver(&self, mut raw: Vec<RawFrame>) -> io::Result<bool> {
+        if raw.is_empty() {
+            return Ok(true);
+        }
+        let mut missing = lock(&self.missing);
+        let before = *missing;
+        if before > 0 {
+            let lost = TraceEvent::Lost { stage: Some(LossStage::Host), count: before, at_least: false };
+            raw.splice(..0, raw_error(&lost));
+        }
+        let (taken, error) = match self.port.send(&raw) {
+            Ok(taken) => (taken, None),
+            Err(error) => (0, Some(error)),
+        };
+        if taken > 0 {
+            *missing = 0;
+        }
+        let told = usize::from(before > 0 && taken == 0);
+        let left = (raw.len() - taken - told) as u32;
+        if left == 0 && error.is_none() {
+            return Ok(true);
+        }
+        *missing = missing.saturating_add(left);
+        add(&self.counts.undelivered, left as usize);
+        if before == 0 {
+            let why = error.as_ref().map_or_else(|| "its buffer is full".to_owned(), ToString::to_string);
+            stderr::warn(&format!(
+                "{} does not take what is heard ({why}): it is counted as lost",
+                self.name
+            ));
+        }
+        match error {
+            // It has been deleted.
+            Some(error) if matches!(error.raw_os_error(), Some(ENODEV | ENXIO)) => Err(error),
+            _ => Ok(false),
+        }
+    }
+}
+
+const ENXIO: i32 = nix::errno::Errno::ENXIO as i32;
+const ENODEV: i32 = nix::errno::Errno::ENODEV as i32;

@@ -1,0 +1,285 @@
+//! The way from programs to the buses. It waits neither for what is heard nor for the other channel: a bus on which nothing leaves
+//! leaves its own frames in the interface's socket.
+
+use std::collections::HashMap;
+use std::io;
+use std::os::fd::BorrowedFd;
+use std::sync::atomic::{AtomicBool, AtomicU32, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use cantap::transmit::Stream;
+use cantap::wire::Frame;
+use cantap::wire::message::Mode;
+use cantap::{Device, DeviceError};
+use rustix::event::{PollFd, PollFlags, poll};
+
+use super::frames::{RawFrame, frame_of};
+use super::interface::BATCH;
+use super::lane::Lane;
+use crate::address::OpenDevice;
+use crate::{advice, stderr};
+
+/// How often to look for confirmations while frames are on their way.
+const CONFIRM_EVERY: Duration = Duration::from_millis(2);
+/// A thread that waits for nothing follows a change within this many milliseconds.
+const FOLLOWS_IN_MS: u32 = 500;
+/// How often to check whether to go on.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+
+/// The thread that sends.
+pub struct Sender {
+    shared: Arc<Shared>,
+    thread: Option<JoinHandle<()>>,
+}
+
+struct Shared {
+    /// The device, while it is there.
+    device: Mutex<Option<Arc<OpenDevice>>>,
+    /// How often that has changed, and which change the thread has followed.
+    wanted: AtomicU32,
+    followed: AtomicU32,
+    quit: AtomicBool,
+    /// An interface is gone.
+    failed: Mutex<Option<String>>,
+}
+
+impl Shared {
+    fn device(&self) -> Option<Arc<OpenDevice>> {
+        self.device.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    fn goes_on(&self, with: &Arc<OpenDevice>) -> bool {
+        !self.quit.load(Ordering::Relaxed) && self.device().is_some_and(|device| Arc::ptr_eq(&device, with))
+    }
+}
+
+impl Sender {
+    /// Starts it. Until there is a device, what programs write is refused.
+    pub fn start(lanes: Arc<[Lane]>) -> io::Result<Self> {
+        let shared = Arc::new(Shared {
+            device: Mutex::new(None),
+            wanted: AtomicU32::new(0),
+            followed: AtomicU32::new(0),
+            quit: AtomicBool::new(false),
+            failed: Mutex::new(None),
+        });
+        let for_thread = Arc::clone(&shared);
+        let thread = std::thread::Builder::new().name("cantap-bridge".to_owned()).spawn(move || {
+            if let Err(error) = run(&for_thread, &lanes) {
+                *for_thread.failed.lock().unwrap_or_else(PoisonError::into_inner) = Some(error.to_string());
+            }
+        })?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    /// A device is there, or none is. What programs wrote before is not sent; what they write when this returns is, unless the thread
+    /// does not follow in time.
+    pub fn use_device(&self, device: Option<Arc<OpenDevice>>) {
+        *self.shared.device.lock().unwrap_or_else(PoisonError::into_inner) = device;
+        let wanted = self.shared.wanted.fetch_add(1, Ordering::Relaxed) + 1;
+        for _ in 0..FOLLOWS_IN_MS {
+            if self.shared.followed.load(Ordering::Relaxed) == wanted {
+                return;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+
+    /// Why it cannot go on, if it cannot.
+    pub fn failed(&self) -> Option<String> {
+        self.shared.failed.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+impl Drop for Sender {
+    fn drop(&mut self) {
+        self.shared.quit.store(true, Ordering::Relaxed);
+        if let Some(thread) = self.thread.take() {
+            let _ = thread.join();
+        }
+    }
+}
+
+/// Takes frames from one interface.
+struct Inlet<'l> {
+    lane: &'l Lane,
+    raw: Vec<RawFrame>,
+    /// What the kernel has thrown away by now.
+    thrown_away: u32,
+    /// On their way, by tag.
+    under_way: HashMap<u32, Frame>,
+}
+
+impl<'l> Inlet<'l> {
+    fn new(lane: &'l Lane) -> Self {
+        Self { lane, raw: Vec::new(), thrown_away: 0, under_way: HashMap::new() }
+    }
+
+    /// Takes what is there, at most so much. Returns whether there was anything.
+    fn receive(&mut self, most: usize) -> io::Result<bool> {
+        self.raw.clear();
+        let thrown_away = self.lane.port.receive(most.min(BATCH), &mut self.raw)?;
+        // The kernel tells the number with frames alone.
+        if thrown_away > self.thrown_away {
+            self.lane.overflowed(thrown_away - self.thrown_away)?;
+            self.thrown_away = thrown_away;
+        }
+        Ok(!self.raw.is_empty())
+    }
+
+    /// Refuses what is there.
+    fn refuse_all(&mut self) -> io::Result<()> {
+        while self.receive(BATCH)? {
+            self.lane.refuse(self.raw.len())?;
+        }
+        Ok(())
+    }
+
+    /// Nobody knows what becomes of what is on its way.
+    fn forget(&mut self) -> io::Result<()> {
+        let under_way = std::mem::take(&mut self.under_way);
+        for frame in under_way.values() {
+            self.lane.has_ended(frame);
+        }
+        self.lane.refuse(under_way.len())
+    }
+}
+
+/// The thread's body. An error is an interface that is gone.
+fn run(shared: &Shared, lanes: &[Lane]) -> io::Result<()> {
+    let mut inlets: Vec<Inlet<'_>> = lanes.iter().map(Inlet::new).collect();
+    while !shared.quit.load(Ordering::Relaxed) {
+        let wanted = shared.wanted.load(Ordering::Relaxed);
+        let current = shared.device();
+        // What was written while there was no device, or another one, was meant for then.
+        if current.is_none() || shared.followed.load(Ordering::Relaxed) != wanted {
+            for inlet in &mut inlets {
+                inlet.refuse_all()?;
+            }
+        }
+        shared.followed.store(wanted, Ordering::Relaxed);
+        let Some(device) = current else {
+            wait_for(inlets.iter(), LOOK_EVERY);
+            continue;
+        };
+        let ended = session(shared, &device, &mut inlets);
+        for inlet in &mut inlets {
+            inlet.forget()?;
+        }
+        match ended {
+            Ok(()) => {}
+            Err(Ended::Interface(error)) => return Err(error),
+            // The stream of records tells.
+            Err(Ended::Device(error)) if error.is_of_the_connection() => {
+                let mut current = shared.device.lock().unwrap_or_else(PoisonError::into_inner);
+                if current.as_ref().is_some_and(|current| Arc::ptr_eq(current, &device)) {
+                    *current = None;
+                }
+            }
+            Err(Ended::Device(error)) => {
+                stderr::warn(&format!(
+                    "frames of programs were not sent, or nobody knows: {}",
+                    advice::sentence(&error.into())
+                ));
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Why sending to a device ended.
+enum Ended {
+    Device(DeviceError),
+    Interface(io::Error),
+}
+
+impl From<DeviceError> for Ended {
+    fn from(error: DeviceError) -> Self {
+        Self::Device(error)
+    }
+}
+
+impl From<io::Error> for Ended {
+    fn from(error: io::Error) -> Self {
+        Self::Interface(error)
+    }
+}
+
+/// Sends to a device until it is another's turn.
+fn session(shared: &Shared, device: &Arc<OpenDevice>, inlets: &mut [Inlet<'_>]) -> Result<(), Ended> {
+    let room = usize::from(device.hello().tx_queue).max(1);
+    let mut stream = Stream::new(device);
+    while shared.goes_on(device) {
+        let mut is_idle = true;
+        for inlet in &mut *inlets {
+            let free = room.saturating_sub(inlet.under_way.len());
+            if free == 0 || !inlet.receive(free)? {
+                continue;
+            }
+            is_idle = false;
+            take(inlet, device, &mut stream)?;
+        }
+        stream.flush()?;
+        stream.wait(Duration::ZERO)?;
+        for end in stream.take_ended() {
+            let Some(inlet) = inlets.iter_mut().find(|inlet| inlet.lane.channel == end.channel) else {
+                continue;
+            };
+            let Some(frame) = inlet.under_way.remove(&end.tag) else { continue };
+            if end.result.is_ok() {
+                inlet.lane.count_sent();
+            } else {
+                // Programs are told by the record.
+                inlet.lane.has_ended(&frame);
+                inlet.lane.count_not_sent();
+            }
+        }
+        if is_idle {
+            let is_waiting = inlets.iter().any(|inlet| !inlet.under_way.is_empty());
+            let with_room = inlets.iter().filter(|inlet| inlet.under_way.len() < room);
+            wait_for(with_room, if is_waiting { CONFIRM_EVERY } else { LOOK_EVERY });
+        }
+    }
+    Ok(())
+}
+
+/// Sends what was received.
+fn take(inlet: &mut Inlet<'_>, device: &Device, stream: &mut Stream<'_>) -> Result<(), Ended> {
+    let lane = inlet.lane;
+    let sends = device
+        .open_channels()
+        .iter()
+        .any(|(channel, config)| *channel == lane.channel && config.mode != Mode::ListenOnly);
+    if !sends {
+        lane.refuse_listening(inlet.raw.len())?;
+        return Ok(());
+    }
+    let mut refused = 0;
+    for raw in &inlet.raw {
+        let Some(frame) = frame_of(raw) else {
+            refused += 1;
+            continue;
+        };
+        // Before it can be confirmed.
+        lane.sends(frame);
+        // There is room: it does not wait.
+        match stream.push(lane.channel, frame, None, |_| true)? {
+            Some(tag) => drop(inlet.under_way.insert(tag, frame)),
+            None => refused += 1,
+        }
+    }
+    Ok(lane.refuse(refused)?)
+}
+
+/// Waits until a program has written, at most so long.
+fn wait_for<'i, 'l: 'i>(inlets: impl Iterator<Item = &'i Inlet<'l>>, timeout: Duration) {
+    let sockets: Vec<BorrowedFd<'_>> = inlets.filter_map(|inlet| inlet.lane.port.as_fd()).collect();
+    let mut waiting: Vec<PollFd<'_>> =
+        sockets.iter().map(|socket| PollFd::new(socket, PollFlags::IN)).collect();
+    let limit = rustix::event::Timespec { tv_sec: 0, tv_nsec: timeout.subsec_nanos().into() };
+    if waiting.is_empty() || poll(&mut waiting, Some(&limit)).is_err() {
+        std::thread::sleep(CONFIRM_EVERY);
+    }
+}

@@ -1,0 +1,233 @@
+//! `cantap canopen`: talks with nodes.
+
+mod lss;
+mod objects;
+mod scan;
+
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::bail;
+use cantap::{Frame, Id};
+use cantap_protocols::Event;
+use cantap_protocols::active::Announcement;
+use cantap_protocols::canopen::{CanOpen, Sheet, state_name};
+
+use crate::args;
+use crate::protocols::SheetPath;
+use crate::speaking::SpeakArgs;
+use crate::wrong::wrong;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap canopen -d /dev/ttyACM0 -b 500k scan\n  \
+    cantap canopen -d COM5 -b 250k read 5 1018 4\n  \
+    cantap canopen -d COM5 -b 250k write 5 1017 0 500 --type u16\n  \
+    cantap canopen -d COM5 -b 250k --eds 5:drive.eds read 5 6041\n  \
+    cantap canopen -d COM5 -b 250k nmt 5 start\n  \
+    cantap canopen -d COM5 -b 125k lss --node 12 --store\n\n\
+It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What was said is\n\
+shown as `cantap conversations` does.")]
+pub struct Args {
+    #[command(flatten)]
+    speak: SpeakArgs,
+    /// The sheet (EDS or DCF) of nodes; with a node's number before it (5:drive.eds), that node's. Can be repeated.
+    #[arg(long = "eds", value_name = "[NODE:]FILE", global = true)]
+    sheets: Vec<SheetPath>,
+    /// How long to wait for each answer; by default 1s, and 100ms for LSS.
+    #[arg(long, value_name = "TIME", value_parser = args::positive_duration, global = true)]
+    timeout: Option<Duration>,
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand)]
+enum What {
+    /// Find nodes: by asking each for its device type, and by heartbeats.
+    Scan(scan::ScanArgs),
+    /// Read an object.
+    Read(objects::ReadObject),
+    /// Write an object.
+    Write(objects::WriteObject),
+    /// Change the state of a node, or of all.
+    Nmt {
+        /// The node, 1 to 127, or all.
+        #[arg(value_parser = node_or_all)]
+        node: u8,
+        /// What it is to do.
+        #[arg(value_enum)]
+        command: Command,
+    },
+    /// Show what nodes say: states, emergencies, heartbeats that are missing, transfers of others. Nothing is sent.
+    Monitor {
+        /// End after this time.
+        #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
+        time: Option<Duration>,
+    },
+    /// Send SYNC again and again, by the device's clock.
+    Sync {
+        #[command(flatten)]
+        cyclic: Cyclic,
+        /// Its identifier in hexadecimal.
+        #[arg(long, value_name = "ID", default_value = "080")]
+        cob_id: Id,
+    },
+    /// Send the heartbeat of a node again and again, by the device's clock.
+    Heartbeat {
+        /// The node that it pretends to be, 1 to 127.
+        #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+        node: u8,
+        /// Its state.
+        #[arg(long, value_enum, default_value = "operational")]
+        state: State,
+        #[command(flatten)]
+        cyclic: Cyclic,
+    },
+    /// Find a node that has no number (fast scan), and give it a number and a bit rate.
+    Lss(lss::LssArgs),
+}
+
+/// How often.
+#[derive(clap::Args)]
+struct Cyclic {
+    /// The time between two.
+    #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
+    period: Duration,
+    /// How many.
+    #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    count: Option<u32>,
+    /// End after this time. Without it and --count, it goes on until Ctrl-C.
+    #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
+    time: Option<Duration>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum Command {
+    Start,
+    Stop,
+    /// Enter pre-operational.
+    Preop,
+    Reset,
+    /// Reset the communication only.
+    ResetComm,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum State {
+    Stopped,
+    Operational,
+    PreOperational,
+}
+
+fn node_or_all(text: &str) -> Result<u8, String> {
+    match (text, text.parse()) {
+        ("all", _) => Ok(0),
+        (_, Ok(node @ 1..=127)) => Ok(node),
+        _ => Err("nodes are 1 to 127, or all".to_owned()),
+    }
+}
+
+/// The time after a state was asked for in which it is heard.
+const OBEYS: Duration = Duration::from_secs(1);
+const ANSWER: Duration = Duration::from_secs(1);
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let sheets =
+        args.sheets.iter().map(|path| path.load(args.speak.json)).collect::<anyhow::Result<Vec<_>>>()?;
+    let ns =
+        |default: Duration| args.timeout.unwrap_or(default).as_nanos().min(u128::from(u64::MAX / 4)) as u64;
+    match &args.what {
+        What::Scan(scan) => scan::run(&args.speak, scan, ns(Duration::from_millis(250)), sheets)?,
+        What::Read(read) => objects::read(&args.speak, read, ns(ANSWER), sheets)?,
+        What::Write(write) => objects::write(&args.speak, write, ns(ANSWER), sheets)?,
+        What::Nmt { node, command } => nmt(&args.speak, *node, *command, sheets)?,
+        What::Monitor { time } => monitor(&args.speak, *time, sheets)?,
+        What::Sync { cyclic, cob_id } => {
+            let Some(frame) = Frame::data_frame(*cob_id, &[]) else { bail!("SYNC has no data") };
+            repeat(&args.speak, frame, cyclic)?;
+        }
+        What::Heartbeat { node, state, cyclic } => {
+            let state = match state {
+                State::Stopped => 4,
+                State::Operational => 5,
+                State::PreOperational => 127,
+            };
+            let id = Id::standard_truncated(0x700 + u32::from(*node));
+            let Some(frame) = Frame::data_frame(id, &[state]) else { bail!("a heartbeat has one byte") };
+            repeat(&args.speak, frame, cyclic)?;
+        }
+        What::Lss(lss) => lss::run(&args.speak, lss, ns(Duration::from_millis(100)))?,
+    }
+    Ok(ExitCode::SUCCESS)
+}
+
+fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> anyhow::Result<()> {
+    let (number, becomes) = match command {
+        Command::Start => (1, 5),
+        Command::Stop => (2, 4),
+        Command::Preop => (128, 127),
+        Command::Reset => (129, 127),
+        Command::ResetComm => (130, 127),
+    };
+    let Some(frame) = Frame::data_frame(Id::standard_truncated(0), &[number, node]) else {
+        bail!("a command has two bytes");
+    };
+    let device = speak.open()?;
+    let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
+    speaking.run(&mut Announcement::new([frame]))?;
+    let said = |event: &Event| matches!(event.kind, "nmt" | "boot_up" | "state" | "emergency");
+    speaking.tell(said)?;
+    // What became of it, where nodes tell their states.
+    speaking.listen(OBEYS)?;
+    let events = speaking.take_events();
+    let is_heard = events.iter().any(|event| matches!(event.kind, "boot_up" | "state"));
+    speaking.put_back(events);
+    speaking.tell(said)?;
+    if !is_heard {
+        let state = state_name(becomes).unwrap_or_default();
+        eprintln!(
+            "cantap: the command was sent and acknowledged; no node told a new state within {} s, so whether it is {state} is not known",
+            OBEYS.as_secs()
+        );
+    }
+    drop(speaking);
+    device.stop()?;
+    Ok(())
+}
+
+fn monitor(speak: &SpeakArgs, time: Option<Duration>, sheets: Vec<Sheet>) -> anyhow::Result<()> {
+    let device = speak.listen()?;
+    let mut speaking = speak.speak(&device, Box::new(CanOpen::new(sheets)));
+    let started = std::time::Instant::now();
+    while !crate::interrupt::requested() {
+        let left = time.map(|time| time.saturating_sub(started.elapsed()));
+        if left.is_some_and(|left| left.is_zero()) {
+            break;
+        }
+        speaking.listen(left.unwrap_or(Duration::MAX).min(Duration::from_millis(50)))?;
+        speaking.tell(|_| true)?;
+    }
+    drop(speaking);
+    device.stop()?;
+    Ok(())
+}
+
+fn repeat(speak: &SpeakArgs, frame: Frame, cyclic: &Cyclic) -> anyhow::Result<()> {
+    if cyclic.period < cantap::periodic::SHORTEST_PERIOD {
+        return Err(wrong(format!(
+            "a period is at least {} us",
+            cantap::periodic::SHORTEST_PERIOD.as_micros()
+        )));
+    }
+    let device = speak.open()?;
+    let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
+    let sent = speaking.repeat(frame, cyclic.period, cyclic.count, cyclic.time)?;
+    let own = |event: &Event| matches!(event.kind, "sync" | "state" | "heartbeat");
+    speaking.tell(own)?;
+    eprintln!("cantap: {sent} frames were sent");
+    drop(speaking);
+    device.stop()?;
+    Ok(())
+}

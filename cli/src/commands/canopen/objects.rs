@@ -1,0 +1,208 @@
+//! Reading and writing objects.
+
+use anyhow::{Context, anyhow};
+use cantap::{TraceEvent, TraceRecord};
+use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
+use cantap_protocols::canopen::{CanOpen, Sheet, encode, known_type, type_named};
+use cantap_protocols::iso_tp::Pair;
+use cantap_protocols::{Assembler, Event};
+
+use crate::speaking::{SpeakArgs, Speaking};
+use crate::wrong::wrong;
+
+/// Which object, and how.
+#[derive(clap::Args)]
+struct Place {
+    /// The node, 1 to 127.
+    #[arg(value_parser = clap::value_parser!(u8).range(1..=127))]
+    node: u8,
+    /// The object's index in hexadecimal, as 1018.
+    #[arg(value_parser = index)]
+    index: u16,
+    /// By block transfer: up to 127 frames for one answer. Not every node has it.
+    #[arg(long)]
+    block: bool,
+    /// The identifiers of the SDO channel where they are not the node's usual ones: the request's and the answer's, as 605:585.
+    #[arg(long, value_name = "ID:ID")]
+    sdo: Option<Pair>,
+}
+
+/// The command line of reading.
+#[derive(clap::Args)]
+pub(super) struct ReadObject {
+    #[command(flatten)]
+    place: Place,
+    /// Its sub-index in hexadecimal.
+    #[arg(value_parser = sub, default_value = "0")]
+    sub: u8,
+    /// Write the object's bytes to this file.
+    #[arg(short, long, value_name = "FILE")]
+    output: Option<std::path::PathBuf>,
+}
+
+/// The command line of writing.
+#[derive(clap::Args)]
+pub(super) struct WriteObject {
+    #[command(flatten)]
+    place: Place,
+    /// Its sub-index in hexadecimal.
+    #[arg(value_parser = sub)]
+    sub: u8,
+    /// The value, as its type has it: 1500, 0x5DC, -3, 1.5, a text; @FILE for a file's bytes.
+    #[arg(allow_hyphen_values = true)]
+    value: String,
+    /// Its type, where no sheet tells it: bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex.
+    #[arg(long = "type", value_name = "TYPE")]
+    data_type: Option<String>,
+}
+
+fn index(text: &str) -> Result<u16, String> {
+    u16::from_str_radix(text.trim_start_matches("0x"), 16)
+        .map_err(|_| "write up to four hexadecimal digits, as 1018".to_owned())
+}
+
+fn sub(text: &str) -> Result<u8, String> {
+    u8::from_str_radix(text.trim_start_matches("0x"), 16)
+        .map_err(|_| "write up to two hexadecimal digits, as 4".to_owned())
+}
+
+impl Place {
+    fn ids(&self) -> SdoIds {
+        self.sdo
+            .map_or_else(|| SdoIds::of(self.node), |pair| SdoIds { request: pair.a.id, response: pair.b.id })
+    }
+
+    /// Reads the conversation, on whatever identifiers it is.
+    fn witness(&self, sheets: Vec<Sheet>) -> Box<dyn Assembler> {
+        let witness = Box::new(CanOpen::new(sheets));
+        match self.sdo {
+            None => witness,
+            Some(_) => Box::new(Renamed { inner: witness, from: self.ids(), to: SdoIds::of(self.node) }),
+        }
+    }
+
+    fn is_ours(&self, event: &Event) -> bool {
+        matches!(event.kind, "sdo_read" | "sdo_write")
+            && event
+                .field("index")
+                .is_some_and(|index| index.value.as_number() == Some(f64::from(self.index)))
+    }
+
+    fn transfer(
+        &self,
+        speaking: &mut Speaking<'_>,
+        sub: u8,
+        job: SdoJob,
+        timeout_ns: u64,
+    ) -> anyhow::Result<Vec<u8>> {
+        let mut client = SdoClient::new(self.ids(), self.index, sub, job, self.block, timeout_ns);
+        speaking.run(&mut client)?;
+        speaking.tell(|event| self.is_ours(event))?;
+        client.finish().map_err(|error| {
+            let object = format!("node {}, object {:04X}:{:X}", self.node, self.index, sub);
+            match error {
+                SdoError::NoAnswer { done: 0, .. } => anyhow!(
+                    "{object}: {error}; {}; check the node's number (`cantap canopen scan`) and that it is not stopped",
+                    speaking.circumstances()
+                ),
+                SdoError::Aborted { code: 0x0504_0001 } if self.block => {
+                    anyhow!("{object}: {error}; the node may not have block transfers: leave --block away")
+                }
+                SdoError::NoAnswer { .. } => anyhow!("{object}: {error}; {}", speaking.circumstances()),
+                _ => anyhow!("{object}: {error}"),
+            }
+        })
+    }
+}
+
+/// Shows an SDO channel's frames as those of the node's usual one.
+struct Renamed {
+    inner: Box<CanOpen>,
+    from: SdoIds,
+    to: SdoIds,
+}
+
+impl Assembler for Renamed {
+    fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
+        let TraceEvent::Frame { frame, direction, late } = record.event else {
+            return self.inner.take(record, events);
+        };
+        let id = match frame.id() {
+            id if id == self.from.request => self.to.request,
+            id if id == self.from.response => self.to.response,
+            _ => return self.inner.take(record, events),
+        };
+        if let Some(frame) = cantap::Frame::data_frame(id, frame.data()) {
+            let event = TraceEvent::Frame { frame: frame.into(), direction, late };
+            self.inner.take(&TraceRecord { event, ..*record }, events);
+        }
+    }
+
+    fn finish(&mut self, events: &mut Vec<Event>) {
+        self.inner.finish(events);
+    }
+}
+
+/// Reads an object.
+pub(super) fn read(
+    speak: &SpeakArgs,
+    args: &ReadObject,
+    timeout_ns: u64,
+    sheets: Vec<Sheet>,
+) -> anyhow::Result<()> {
+    let device = speak.open()?;
+    let mut speaking = speak.speak(&device, args.place.witness(sheets));
+    let data = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, timeout_ns)?;
+    drop(speaking);
+    device.stop()?;
+    if let Some(path) = &args.output {
+        std::fs::write(path, data).with_context(|| format!("cannot write {}", path.display()))?;
+    }
+    Ok(())
+}
+
+/// Writes an object.
+pub(super) fn write(
+    speak: &SpeakArgs,
+    args: &WriteObject,
+    timeout_ns: u64,
+    sheets: Vec<Sheet>,
+) -> anyhow::Result<()> {
+    // Everything that can be wrong is found before anything is sent.
+    let data = args.bytes(&sheets)?;
+    let device = speak.open()?;
+    let mut speaking = speak.speak(&device, args.place.witness(sheets));
+    args.place.transfer(&mut speaking, args.sub, SdoJob::Write(data), timeout_ns)?;
+    drop(speaking);
+    device.stop()?;
+    Ok(())
+}
+
+impl WriteObject {
+    fn bytes(&self, sheets: &[Sheet]) -> anyhow::Result<Vec<u8>> {
+        if let Some(path) = self.value.strip_prefix('@') {
+            return std::fs::read(path).with_context(|| format!("cannot read {path}"));
+        }
+        let (Place { node, index, .. }, sub) = (&self.place, self.sub);
+        let (node, index) = (*node, *index);
+        let entry = || {
+            let sheet = sheets.iter().find(|sheet| sheet.node == Some(node));
+            let sheet = sheet.or_else(|| sheets.iter().find(|sheet| sheet.node.is_none()))?;
+            sheet.eds.entry_of(index, sub)?.data_type
+        };
+        let data_type = match &self.data_type {
+            Some(name) => Some(type_named(name).ok_or_else(|| {
+                wrong(format!(
+                    "there is no type '{name}'; there are bool, u8 to u64, i8 to i64, f32, f64, text, utf16, hex, domain"
+                ))
+            })?),
+            None => entry().or_else(|| known_type(index, sub)),
+        };
+        let Some(data_type) = data_type else {
+            return Err(wrong(format!(
+                "the type of {index:04X}:{sub:X} is not known; give it with --type, as --type u16, or the node's sheet with --eds"
+            )));
+        };
+        encode(data_type, &self.value).map_err(|error| wrong(error.to_string()))
+    }
+}

@@ -1,0 +1,107 @@
+//! What frames say together, in the forms of decoded frames.
+
+use std::io::{self, Write};
+
+use cantap_protocols::{Event, Party, Value, naming};
+use cantap_trace::Interface;
+
+use super::csv::field as quoted;
+use super::decoded::Seconds;
+
+/// Names and values, with those that every event has behind its own.
+fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
+    let mut fields: Vec<(String, Value, String, Option<String>)> = Vec::new();
+    for field in &event.fields {
+        let name = naming::plain(&field.name);
+        let before = fields
+            .iter()
+            .filter(|(known, ..)| *known == name || known.starts_with(&format!("{name}_")))
+            .count();
+        let name = if before == 0 { name } else { format!("{name}_{}", before + 1) };
+        let text = field.text.as_ref().map(ToString::to_string);
+        fields.push((name, field.value.clone(), field.unit.to_string(), text));
+    }
+    let mut add = |name: &str, value: Value| fields.push((name.to_owned(), value, String::new(), None));
+    add("kind", Value::Text(event.kind.into()));
+    if let Some(ns) = event.response_ns {
+        add("response_ms", Value::Real(ns as f64 / 1e6));
+    }
+    if let Some(trouble) = &event.trouble {
+        add("trouble", Value::Text(trouble.code().into()));
+    }
+    if event.frames_lost {
+        add("frames_lost", Value::Number(1));
+    }
+    fields
+}
+
+/// The identifier or node that said it; empty where it is not known.
+fn sender(event: &Event) -> String {
+    if event.from == Party::Unknown { String::new() } else { event.from.to_string() }
+}
+
+/// As `cantap conversations` has it.
+pub fn text(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    writeln!(out, "({}) {} {event}", Seconds(event.time_ns), Interface(event.channel))
+}
+
+/// A line per field; a text stands in the last column.
+pub fn csv(out: &mut impl Write, event: &Event) -> io::Result<()> {
+    for (name, value, unit, text) in fields(event) {
+        let (number, own) = match &value {
+            Value::Number(_) | Value::Real(_) => (value.to_string(), None),
+            Value::Hex(number, _) => (number.to_string(), None),
+            Value::Text(text) => (String::new(), Some(text.to_string())),
+            Value::Bytes(_) => (String::new(), Some(value.to_string())),
+            Value::Missing => (String::new(), Some("not available".to_owned())),
+        };
+        write!(
+            out,
+            "{},{},{},{},{}.{name},{number},{},{}\r\n",
+            Seconds(event.time_ns),
+            event.channel,
+            sender(event),
+            quoted(&event.title),
+            event.protocol,
+            quoted(&unit),
+            quoted(&text.or(own).unwrap_or_default())
+        )?;
+    }
+    Ok(())
+}
+
+/// An object; with `details` each value is one too.
+pub fn json(out: &mut impl Write, event: &Event, details: bool) -> io::Result<()> {
+    let mut signals = serde_json::Map::new();
+    for (name, value, unit, text) in fields(event) {
+        let value = match value {
+            Value::Number(number) => number.into(),
+            Value::Hex(number, _) => number.into(),
+            Value::Real(number) => number.into(),
+            Value::Text(text) => text.into_owned().into(),
+            Value::Bytes(_) => value.to_string().into(),
+            Value::Missing => serde_json::Value::Null,
+        };
+        let value = if details {
+            let mut object = serde_json::json!({ "value": value });
+            if !unit.is_empty() {
+                object["unit"] = unit.into();
+            }
+            if let Some(text) = text {
+                object["text"] = text.into();
+            }
+            object
+        } else {
+            value
+        };
+        signals.insert(format!("{}.{name}", event.protocol), value);
+    }
+    let party = |party: Party| if party == Party::Unknown { None } else { Some(party.to_string()) };
+    let rest = serde_json::json!({
+        "id": sender(event), "message": event.title, "protocol": event.protocol.name(),
+        "from": party(event.from), "to": party(event.to), "signals": signals,
+    });
+    // The time by hand, for all of its digits.
+    let rest = rest.to_string();
+    writeln!(out, "{{\"time_s\":{},\"channel\":{},{}", Seconds(event.time_ns), event.channel, &rest[1..])
+}

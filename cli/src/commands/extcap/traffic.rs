@@ -1,0 +1,133 @@
+//! What the toolbar shows of the traffic: load and losses of each channel.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use cantap::{TraceEvent, TraceRecord};
+use cantap_trace::names::{LOSS_STAGES, name};
+
+use super::toolbar::{Control, Screen};
+
+/// What went by, by the number of its channel.
+#[derive(Default)]
+pub struct Traffic {
+    channels: BTreeMap<u8, OfChannel>,
+    since_start: Duration,
+}
+
+#[derive(Default)]
+struct OfChannel {
+    bitrate_bps: u32,
+    /// Since it was last shown.
+    bits: u64,
+    lost: u64,
+    is_at_least: bool,
+    /// Since it was last shown, in words.
+    losses: Vec<String>,
+    unlisted: u64,
+}
+
+/// This many losses are listed one by one between two looks at the toolbar, and the rest as a number.
+const MOST_LISTED: usize = 8;
+
+impl Traffic {
+    /// How fast a channel's bus is, in bit/s.
+    pub fn set_bit_rate(&mut self, channel: u8, bitrate_bps: u32) {
+        self.channels.entry(channel).or_default().bitrate_bps = bitrate_bps;
+    }
+
+    /// Takes the next record.
+    pub fn push(&mut self, record: &TraceRecord) {
+        let channel = self.channels.entry(record.channel).or_default();
+        match record.event {
+            TraceEvent::Frame { ref frame, .. } => channel.bits += u64::from(frame.bus_bits().total()),
+            TraceEvent::Lost { stage, count, at_least } => {
+                channel.lost += u64::from(count);
+                channel.is_at_least |= at_least;
+                if channel.losses.len() < MOST_LISTED {
+                    let place = stage.map_or("", |stage| name(&LOSS_STAGES, &stage));
+                    let count = amount(u64::from(count), at_least);
+                    channel.losses.push(format!("{count} lost ({place})"));
+                } else {
+                    channel.unlisted += u64::from(count);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Shows what went by in the time since it was last shown.
+    pub fn show(&mut self, screen: &Screen, passed: Duration) {
+        self.since_start += passed;
+        if screen.is_there() {
+            screen.set(Control::Load, &self.load(passed));
+            screen.set(Control::Lost, &self.lost());
+        }
+        let seconds = self.since_start.as_secs_f64();
+        for (number, channel) in &mut self.channels {
+            for loss in channel.losses.drain(..) {
+                screen.log(&format!("{seconds:.0} s, channel {number}: {loss}"));
+            }
+            if channel.unlisted > 0 {
+                screen.log(&format!("{seconds:.0} s, channel {number}: {} more lost", channel.unlisted));
+            }
+            (channel.bits, channel.unlisted) = (0, 0);
+        }
+    }
+
+    fn load(&self, passed: Duration) -> String {
+        let share = |(number, channel): (&u8, &OfChannel)| {
+            let most = f64::from(channel.bitrate_bps) * passed.as_secs_f64();
+            let load = if most > 0.0 { (channel.bits as f64 / most * 100.0).min(100.0) } else { 0.0 };
+            format!("{number}: {load:.0} %")
+        };
+        self.channels.iter().map(share).collect::<Vec<_>>().join("  ")
+    }
+
+    fn lost(&self) -> String {
+        let lost = |(number, channel): (&u8, &OfChannel)| {
+            format!("{number}: {}", amount(channel.lost, channel.is_at_least))
+        };
+        self.channels.iter().map(lost).collect::<Vec<_>>().join("  ")
+    }
+}
+
+fn amount(count: u64, is_at_least: bool) -> String {
+    if is_at_least { format!("at least {count}") } else { count.to_string() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use cantap::Direction;
+    use cantap::wire::record::LossStage;
+
+    #[test]
+    fn load_is_of_the_time_since_and_losses_of_the_whole_capture() {
+        let mut traffic = Traffic::default();
+        traffic.set_bit_rate(1, 500_000);
+        traffic.set_bit_rate(2, 250_000);
+        let record = |event| TraceRecord { time_ns: 0, channel: 1, event };
+        let frame =
+            TraceEvent::Frame { frame: "123#".parse().unwrap(), direction: Direction::Rx, late: false };
+        let bits = u64::from(frame_bits(&frame));
+        for _ in 0..(250_000 / bits) {
+            traffic.push(&record(frame));
+        }
+        traffic.push(&record(TraceEvent::Lost { stage: Some(LossStage::Queue), count: 5, at_least: false }));
+        assert_eq!(traffic.load(Duration::from_secs(1)), "1: 50 %  2: 0 %");
+        assert_eq!(traffic.lost(), "1: 5  2: 0");
+        let (screen, _) = Screen::of_test();
+        traffic.show(&screen, Duration::from_secs(1));
+        traffic.push(&record(TraceEvent::GAP));
+        assert_eq!(traffic.load(Duration::from_secs(1)), "1: 0 %  2: 0 %");
+        assert_eq!(traffic.lost(), "1: at least 5  2: 0");
+    }
+
+    fn frame_bits(event: &TraceEvent) -> u32 {
+        match event {
+            TraceEvent::Frame { frame, .. } => frame.bus_bits().total(),
+            _ => 0,
+        }
+    }
+}

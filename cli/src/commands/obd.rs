@@ -1,0 +1,291 @@
+//! `cantap obd`: asks a vehicle.
+
+use std::collections::BTreeMap;
+use std::io::Write as _;
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::{anyhow, bail};
+use cantap::Id;
+use cantap_protocols::Event;
+use cantap_protocols::diagnostics::{Diagnostics, parameter_name};
+use cantap_protocols::iso_tp::{Endpoint, Pair};
+
+use super::uds::{Client, TransferArgs};
+use crate::speaking::SpeakArgs;
+use crate::{args, interrupt};
+
+/// How long all ECUs have to answer, where it is not known how many there are. ISO 15765-4 has 50 ms.
+const ALL_ANSWER: Duration = Duration::from_millis(200);
+/// Bits of a list of supported parameters.
+const LIST: u8 = 0x20;
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap obd -d virtual:car\n  \
+    cantap obd -d virtual:car live 0C 0D --period 500ms\n  \
+    cantap obd -d /dev/ttyACM0 -b 500k codes\n  \
+    cantap obd -d COM5 -b 500k clear --yes\n\n\
+Without a command: VIN, trouble codes, and every value once. All ECUs are asked at once (7DF), and where none\n\
+answers, with identifiers of 29 bits (18DB33F1). It takes part in the bus: it acknowledges, and sends what it is\n\
+asked for here and nothing else.")]
+pub struct Args {
+    #[command(flatten)]
+    speak: SpeakArgs,
+    #[command(subcommand)]
+    what: Option<What>,
+}
+
+#[derive(clap::Subcommand)]
+enum What {
+    /// Which parameters each ECU has.
+    Supported,
+    /// Values of now, until Ctrl-C.
+    Live {
+        /// Parameters in hexadecimal, as 0C; without any, all that there are.
+        #[arg(value_name = "PID", value_parser = pid)]
+        pids: Vec<u8>,
+        /// How often.
+        #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration)]
+        period: Duration,
+        /// How many times.
+        #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+        count: Option<u32>,
+    },
+    /// Trouble codes: stored, pending and permanent.
+    Codes,
+    /// The vehicle's identification number, and what its ECUs call themselves.
+    Vin,
+    /// Erase the trouble codes, and what was stored with them, which needs --yes.
+    Clear {
+        /// Yes, erase them.
+        #[arg(short, long)]
+        yes: bool,
+    },
+}
+
+fn pid(text: &str) -> Result<u8, String> {
+    u8::from_str_radix(text.trim_start_matches("0x"), 16)
+        .map_err(|_| "write a parameter as two hexadecimal digits, as 0C".to_owned())
+}
+
+/// An ECU that answers.
+struct Server {
+    answers_with: Endpoint,
+    pids: Vec<u8>,
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    if matches!(args.what, Some(What::Clear { yes: false })) {
+        bail!(
+            "clearing erases what the workshop needs to find the fault, and readiness tests start anew; if that is meant, add --yes"
+        );
+    }
+    let device = args.speak.open()?;
+    let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));
+    let mut vehicle = Vehicle { client: Client::new(speaking, transfer(false)), servers: Vec::new() };
+    vehicle.find()?;
+    match &args.what {
+        None => vehicle.everything()?,
+        Some(What::Supported) => {
+            vehicle.lists()?;
+            vehicle.client.speaking.tell(|event| args.speak.json && is_answer(event))?;
+            if !args.speak.json {
+                vehicle.show_lists()?;
+            }
+        }
+        Some(What::Live { pids, period, count }) => vehicle.live(pids, *period, *count)?,
+        Some(What::Codes) => vehicle.codes()?,
+        Some(What::Vin) => vehicle.identification()?,
+        Some(What::Clear { .. }) => {
+            let answers = vehicle.client.ask_whoever(&[0x04], None)?;
+            vehicle.client.speaking.tell(is_answer)?;
+            vehicle.client.all_agreed()?;
+            if answers.is_empty() {
+                bail!(
+                    "no ECU said that it has erased its codes; some want the engine off and the ignition on"
+                );
+            }
+        }
+    }
+    drop(vehicle);
+    device.stop()?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// How all ECUs are asked.
+fn transfer(extended: bool) -> TransferArgs {
+    let endpoint = |id| Endpoint { id, address: None };
+    let (a, b) = if extended {
+        (Id::extended_truncated(0x18DA_10F1), Id::extended_truncated(0x18DA_F110))
+    } else {
+        (Id::standard_truncated(0x7E0), Id::standard_truncated(0x7E8))
+    };
+    TransferArgs::of_obd(Pair { a: endpoint(a), b: endpoint(b) }, ALL_ANSWER, true)
+}
+
+/// Answers, and what broke.
+fn is_answer(event: &Event) -> bool {
+    matches!(event.kind, "exchange" | "refusal" | "broken")
+}
+
+/// The parameters of a list that begins behind `base`.
+fn listed(base: u8, bits: &[u8]) -> Vec<u8> {
+    let bits = bits.iter().take(4).fold(0_u32, |all, byte| all << 8 | u32::from(*byte));
+    (0..u32::from(LIST))
+        .filter(|at| bits >> (31 - at) & 1 == 1)
+        .map(|at| base.wrapping_add(at as u8 + 1))
+        .collect()
+}
+
+struct Vehicle<'d> {
+    client: Client<'d>,
+    servers: Vec<Server>,
+}
+
+impl Vehicle<'_> {
+    /// Who answers.
+    fn find(&mut self) -> anyhow::Result<()> {
+        for extended in [false, true] {
+            self.client.set_transfer(transfer(extended));
+            let answers = self.client.ask_whoever(&[0x01, 0x00], None)?;
+            for answer in answers {
+                if let [0x41, 0x00, bits @ ..] = &answer.data[..] {
+                    self.servers.push(Server { answers_with: answer.from, pids: listed(0, bits) });
+                }
+            }
+            if !self.servers.is_empty() {
+                return Ok(());
+            }
+        }
+        Err(anyhow!(
+            "no ECU answers, neither to 7DF nor to 18DB33F1; {}; check that the ignition is on, and the bit rate: vehicles have 500k \
+             or 250k",
+            self.client.speaking.circumstances()
+        ))
+    }
+
+    /// The lists behind the first, as far as they go.
+    fn lists(&mut self) -> anyhow::Result<()> {
+        for base in (LIST..=0xE0).step_by(usize::from(LIST)) {
+            let servers = self.having(base);
+            if servers == 0 {
+                break;
+            }
+            for answer in self.client.ask_whoever(&[0x01, base], Some(servers))? {
+                let [0x41, asked, bits @ ..] = &answer.data[..] else { continue };
+                let server = self.servers.iter_mut().find(|server| server.answers_with == answer.from);
+                if let Some(server) = server.filter(|_| *asked == base) {
+                    server.pids.extend(listed(base, bits));
+                }
+            }
+        }
+        Ok(())
+    }
+
+    /// How many ECUs have a parameter.
+    fn having(&self, pid: u8) -> usize {
+        self.servers.iter().filter(|server| server.pids.contains(&pid)).count()
+    }
+
+    fn show_lists(&self) -> anyhow::Result<()> {
+        let mut out = std::io::stdout().lock();
+        let mut all: BTreeMap<u8, Vec<String>> = BTreeMap::new();
+        for server in &self.servers {
+            for pid in server.pids.iter().filter(|pid| !pid.is_multiple_of(LIST)) {
+                all.entry(*pid).or_default().push(server.answers_with.to_string());
+            }
+        }
+        for (pid, servers) in all {
+            let name = parameter_name(pid).unwrap_or("(no name known)");
+            writeln!(out, "{pid:02X}  {name:<40}  {}", servers.join(", "))?;
+        }
+        Ok(())
+    }
+
+    /// Values, each as soon as it is there.
+    fn live(&mut self, wanted: &[u8], period: Duration, count: Option<u32>) -> anyhow::Result<()> {
+        self.lists()?;
+        self.client.speaking.take_events();
+        let pids = if wanted.is_empty() { self.all_pids() } else { wanted.to_vec() };
+        if let Some(pid) = pids.iter().find(|pid| self.having(**pid) == 0) {
+            bail!("no ECU has the parameter {pid:02X}; `cantap obd supported` shows those that there are");
+        }
+        let started = Instant::now();
+        let mut rounds = 0;
+        while count.is_none_or(|count| rounds < count) && !interrupt::requested() {
+            self.values(&pids)?;
+            rounds += 1;
+            if count.is_none_or(|count| rounds < count) {
+                self.client.speaking.listen((period * rounds).saturating_sub(started.elapsed()))?;
+            }
+        }
+        Ok(())
+    }
+
+    fn all_pids(&self) -> Vec<u8> {
+        let all = self.servers.iter().flat_map(|server| server.pids.iter().copied());
+        let mut pids: Vec<u8> = all.filter(|pid| !pid.is_multiple_of(LIST)).collect();
+        pids.sort_unstable();
+        pids.dedup();
+        pids
+    }
+
+    fn values(&mut self, pids: &[u8]) -> anyhow::Result<()> {
+        for pid in pids {
+            let servers = self.having(*pid);
+            let asked = self.client.ask_whoever(&[0x01, *pid], Some(servers));
+            if interrupt::requested() {
+                return Ok(());
+            }
+            let answers = asked?.len();
+            self.client.speaking.tell(is_answer)?;
+            if answers < servers {
+                eprintln!("cantap: {pid:02X}: {answers} of {servers} ECUs answered");
+            }
+        }
+        Ok(())
+    }
+
+    fn codes(&mut self) -> anyhow::Result<()> {
+        for service in [0x03, 0x07, 0x0A] {
+            let answers = self.client.ask_whoever(&[service], Some(self.servers.len()))?;
+            self.client.speaking.tell(|event| {
+                is_answer(event)
+                    && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(f64::from(service)))
+            })?;
+            if answers.is_empty() {
+                let kind = ["stored", "pending", "permanent"][usize::from(service / 4)];
+                eprintln!("cantap: no ECU tells {kind} codes");
+            }
+        }
+        Ok(())
+    }
+
+    fn identification(&mut self) -> anyhow::Result<()> {
+        let mut any = false;
+        for kind in [0x02, 0x0A, 0x04] {
+            any |= !self.client.ask_whoever(&[0x09, kind], None)?.is_empty();
+        }
+        self.client.speaking.tell(|event| {
+            is_answer(event) && event.field("sid").is_some_and(|sid| sid.value.as_number() == Some(9.0))
+        })?;
+        if !any {
+            bail!("no ECU tells who it is; vehicles before 2005 often do not");
+        }
+        Ok(())
+    }
+
+    fn everything(&mut self) -> anyhow::Result<()> {
+        if let Err(error) = self.identification() {
+            eprintln!("cantap: {error}");
+        }
+        self.codes()?;
+        self.lists()?;
+        self.client.speaking.take_events();
+        let pids = self.all_pids();
+        self.values(&pids)
+    }
+}

@@ -1,0 +1,272 @@
+//! `cantap uds`: asks an ECU.
+
+mod client;
+mod key;
+
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+
+use anyhow::bail;
+use cantap_protocols::Event;
+use cantap_protocols::diagnostics::Diagnostics;
+
+pub use self::client::{Client, TransferArgs};
+use self::key::KeyArgs;
+use crate::speaking::SpeakArgs;
+use crate::{args, interrupt};
+
+/// The command line.
+#[derive(clap::Args)]
+#[command(after_help = "Examples:\n  \
+    cantap uds -d virtual:car read F190 F18C\n  \
+    cantap uds -d /dev/ttyACM0 -b 500k --session extended read F190\n  \
+    cantap uds -d COM5 -b 500k --pair 18DA10F1:18DAF110 dtc\n  \
+    cantap uds -d COM5 -b 500k --session extended --security 1 --key-command './key' routine start FF00\n  \
+    cantap uds -d COM5 -b 500k raw '22 F1 90'\n\n\
+It takes part in the bus: it acknowledges, and sends what it is asked for here and nothing else. What was said is\n\
+shown as `cantap conversations` does. A refusal is exit code 1.")]
+pub struct Args {
+    #[command(flatten)]
+    speak: SpeakArgs,
+    #[command(flatten)]
+    transfer: TransferArgs,
+    /// First open this session: default, programming, extended, safety, or its number in hexadecimal.
+    #[arg(long, value_name = "SESSION", global = true, value_parser = session)]
+    session: Option<u8>,
+    #[command(flatten)]
+    key: KeyArgs,
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(clap::Subcommand)]
+enum What {
+    /// Read data by identifier.
+    Read {
+        /// The identifiers in hexadecimal, as F190.
+        #[arg(required = true, value_name = "DID", value_parser = word)]
+        dids: Vec<u16>,
+    },
+    /// Open a session; it ends some seconds after the last request.
+    Session {
+        /// default, programming, extended, safety, or its number in hexadecimal.
+        #[arg(value_name = "SESSION", value_parser = session)]
+        kind: u8,
+    },
+    /// Control a routine.
+    Routine {
+        /// What to do with it.
+        #[arg(value_enum)]
+        action: RoutineAction,
+        /// Its identifier in hexadecimal, as FF00.
+        #[arg(value_name = "ID", value_parser = word)]
+        routine: u16,
+        /// Its option record in hexadecimal.
+        #[arg(value_name = "HEX", value_parser = bytes)]
+        option: Option<Hex>,
+    },
+    /// Say that a tester is there, so that a session lasts.
+    TesterPresent {
+        /// Again and again, until Ctrl-C, --count or --time, without asking for answers.
+        #[arg(long, value_name = "TIME", value_parser = args::positive_duration)]
+        period: Option<Duration>,
+        /// How many times.
+        #[arg(short = 'n', long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+        count: Option<u32>,
+        /// End after this time.
+        #[arg(short, long, value_name = "TIME", value_parser = args::positive_duration)]
+        time: Option<Duration>,
+    },
+    /// Restart the ECU.
+    Reset {
+        /// Which kind of restart.
+        #[arg(value_enum)]
+        kind: ResetKind,
+    },
+    /// Read trouble codes, or clear them.
+    Dtc {
+        /// Only those with one of these status bits set, in hexadecimal.
+        #[arg(long, value_name = "HEX", default_value = "FF", value_parser = byte)]
+        mask: u8,
+        /// Clear all of them, which needs --yes.
+        #[arg(long)]
+        clear: bool,
+        /// Yes, clear them.
+        #[arg(short, long, requires = "clear")]
+        yes: bool,
+    },
+    /// Send any request.
+    Raw {
+        /// Its bytes in hexadecimal, as 22F190 or 22 F1 90.
+        #[arg(required = true, value_name = "HEX")]
+        bytes: Vec<String>,
+    },
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum RoutineAction {
+    Start,
+    Stop,
+    /// What came of it.
+    Result,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum ResetKind {
+    Hard,
+    KeyOffOn,
+    Soft,
+}
+
+/// Bytes as they are given in hexadecimal.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Hex(pub Vec<u8>);
+
+/// See [`Hex`].
+pub fn bytes(text: &str) -> Result<Hex, String> {
+    let digits: String = text.chars().filter(|letter| !letter.is_whitespace() && *letter != '.').collect();
+    let pairs =
+        || (0..digits.len()).step_by(2).map(|at| u8::from_str_radix(digits.get(at..at + 2)?, 16).ok());
+    let all =
+        (digits.is_ascii() && digits.len().is_multiple_of(2)).then(|| pairs().collect::<Option<Vec<u8>>>());
+    all.flatten()
+        .filter(|bytes| !bytes.is_empty())
+        .map(Hex)
+        .ok_or_else(|| "write bytes in hexadecimal, two digits each, as 22F190".to_owned())
+}
+
+fn number(text: &str, most: u32) -> Option<u32> {
+    let digits = text.trim_start_matches("0x").trim_start_matches("0X");
+    u32::from_str_radix(digits, 16).ok().filter(|number| *number <= most)
+}
+
+fn word(text: &str) -> Result<u16, String> {
+    number(text, 0xFFFF)
+        .map(|word| word as u16)
+        .ok_or_else(|| "write up to four hexadecimal digits, as F190".to_owned())
+}
+
+fn byte(text: &str) -> Result<u8, String> {
+    number(text, 0xFF)
+        .map(|byte| byte as u8)
+        .ok_or_else(|| "write up to two hexadecimal digits, as 2A".to_owned())
+}
+
+fn session(text: &str) -> Result<u8, String> {
+    match text {
+        "default" => Ok(1),
+        "programming" => Ok(2),
+        "extended" => Ok(3),
+        "safety" => Ok(4),
+        _ => number(text, 0x7F).filter(|number| *number > 0).map(|number| number as u8).ok_or_else(|| {
+            "write default, programming, extended, safety, or a number from 1 to 7F".to_owned()
+        }),
+    }
+}
+
+/// What the listener to our own conversation says of it.
+fn is_ours(event: &Event) -> bool {
+    matches!(event.kind, "exchange" | "refusal" | "request" | "broken")
+}
+
+/// Runs it.
+pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
+    let requests = args.requests()?;
+    let pair = args.transfer.pair();
+    let device = args.speak.open()?;
+    let witness = || Box::new(Diagnostics::new(&[pair], false));
+    let speaking = args.speak.speak(&device, witness());
+    let mut client = Client::new(speaking, args.transfer);
+    if let Some(session) = args.session {
+        client.ask(&[0x10, session])?;
+        client.speaking.tell(is_ours)?;
+        client.all_agreed()?;
+    }
+    args.key.unlock(&mut client)?;
+    client.speaking.tell(is_ours)?;
+    if let What::TesterPresent { period: Some(period), count, time } = args.what {
+        stay(&mut client, period, count, time)?;
+    } else {
+        for request in &requests {
+            let asked = client.ask(request);
+            client.speaking.tell(is_ours)?;
+            asked?;
+        }
+        client.all_agreed()?;
+    }
+    drop(client);
+    device.stop()?;
+    Ok(ExitCode::SUCCESS)
+}
+
+/// Says again and again that a tester is there.
+fn stay(
+    client: &mut Client<'_>,
+    period: Duration,
+    count: Option<u32>,
+    time: Option<Duration>,
+) -> anyhow::Result<()> {
+    let started = Instant::now();
+    let mut said = 0;
+    loop {
+        client.tell_only(&[0x3E, 0x80])?;
+        said += 1;
+        client.speaking.tell(is_ours)?;
+        let is_enough = count.is_some_and(|count| said >= count)
+            || time.is_some_and(|time| started.elapsed() + period > time);
+        if is_enough {
+            return Ok(());
+        }
+        let next = period * said;
+        client.speaking.listen(next.saturating_sub(started.elapsed()))?;
+        if interrupt::requested() {
+            return Ok(());
+        }
+    }
+}
+
+impl Args {
+    /// The requests that were asked for.
+    fn requests(&self) -> anyhow::Result<Vec<Vec<u8>>> {
+        Ok(match &self.what {
+            What::Read { dids } => {
+                dids.iter().map(|did| [&[0x22][..], &did.to_be_bytes()].concat()).collect()
+            }
+            What::Session { kind } => vec![vec![0x10, *kind]],
+            What::Routine { action, routine, option } => {
+                let action = match action {
+                    RoutineAction::Start => 1,
+                    RoutineAction::Stop => 2,
+                    RoutineAction::Result => 3,
+                };
+                let option = option.as_ref().map_or(&[][..], |option| &option.0);
+                vec![[&[0x31, action][..], &routine.to_be_bytes(), option].concat()]
+            }
+            What::TesterPresent { count, period, .. } => {
+                if period.is_none() && count.is_some_and(|count| count > 1) {
+                    return Err(crate::wrong::wrong("say how often with --period, as --period 2s"));
+                }
+                vec![vec![0x3E, 0]]
+            }
+            What::Reset { kind } => {
+                let kind = match kind {
+                    ResetKind::Hard => 1,
+                    ResetKind::KeyOffOn => 2,
+                    ResetKind::Soft => 3,
+                };
+                vec![vec![0x11, kind]]
+            }
+            What::Dtc { clear: true, yes: false, .. } => {
+                bail!(
+                    "clearing erases what the workshop needs to find the fault; if that is meant, add --yes"
+                )
+            }
+            What::Dtc { clear: true, .. } => vec![vec![0x14, 0xFF, 0xFF, 0xFF]],
+            What::Dtc { mask, .. } => vec![vec![0x19, 0x02, *mask]],
+            What::Raw { bytes: texts } => {
+                let Hex(request) = bytes(&texts.concat()).map_err(crate::wrong::wrong)?;
+                vec![request]
+            }
+        })
+    }
+}

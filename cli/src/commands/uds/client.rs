@@ -1,0 +1,282 @@
+//! Requests and answers over a device.
+
+use std::time::Duration;
+
+use anyhow::{anyhow, bail};
+use cantap::wire::message::{Filter, FrameKind, Trigger};
+use cantap::{Channel, Id};
+use cantap_protocols::active::exchange::{Answerer, Exchange, ExchangeError, ResponseTiming, ServerAnswer};
+use cantap_protocols::active::transfer::TransferSettings;
+use cantap_protocols::diagnostics::{reason, uds_service};
+use cantap_protocols::iso_tp::{Endpoint, Pair};
+
+use crate::args;
+use crate::speaking::Speaking;
+
+/// The reply slot of the device that sends flow control.
+const FLOW_SLOT: u8 = 0;
+
+/// Whom to ask, and how transfers go; for commands to flatten into theirs.
+#[derive(clap::Args, Clone, Copy)]
+pub struct TransferArgs {
+    /// The ECU: the identifier that it is asked with, and the one that it answers with; 6F1/12:612/F1 where the first data byte is an
+    /// address.
+    #[arg(long, value_name = "ID:ID", default_value = "7E0:7E8", global = true)]
+    pair: Pair,
+    /// Ask all ECUs at once: with 7DF, or with 18DB33F1 where the pair has identifiers of 29 bits.
+    #[arg(long, global = true)]
+    functional: bool,
+    /// How long to wait for the beginning of an answer (P2, and what gateways take).
+    #[arg(long, value_name = "TIME", default_value = "1s", value_parser = args::positive_duration, global = true)]
+    p2: Duration,
+    /// The same after the ECU has said that its answer is pending (P2*).
+    #[arg(long, value_name = "TIME", default_value = "5s", value_parser = args::positive_duration, global = true)]
+    p2_star: Duration,
+    /// How long to wait for one answer at most, however often it is pending.
+    #[arg(long, value_name = "TIME", default_value = "60s", value_parser = args::positive_duration, global = true)]
+    patience: Duration,
+    /// The least distance of the frames of an answer (STmin): up to 127ms, or 100us to 900us.
+    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = separation, global = true)]
+    separation: u8,
+    /// Frames of an answer for one flow control frame; 0 for all.
+    #[arg(long, value_name = "N", default_value_t = 0, global = true)]
+    block_size: u8,
+    /// What fills frames up to eight bytes, in hexadecimal; none sends them as short as they are.
+    #[arg(long, value_name = "HEX|none", default_value = "CC", value_parser = padding, global = true)]
+    padding: Padding,
+    /// Who sends the first flow control frame of an answer: this computer, when it has seen that one is wanted, or the device, within
+    /// microseconds, after the ECU's next frame of any kind.
+    #[arg(long, value_enum, default_value = "host", global = true)]
+    flow_control: FlowBy,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, clap::ValueEnum)]
+enum FlowBy {
+    Host,
+    Device,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+struct Padding(Option<u8>);
+
+fn padding(text: &str) -> Result<Padding, String> {
+    match text {
+        "none" => Ok(Padding(None)),
+        _ => u8::from_str_radix(text, 16)
+            .map(|byte| Padding(Some(byte)))
+            .map_err(|_| "write a byte in hexadecimal, as CC, or none".to_owned()),
+    }
+}
+
+/// As flow control has it.
+fn separation(text: &str) -> Result<u8, String> {
+    let time = args::duration(text)?;
+    match time.as_micros() {
+        us @ 0..=127_000 if us % 1000 == 0 => Ok((us / 1000) as u8),
+        us @ 100..=900 if us % 100 == 0 => Ok(0xF0 + (us / 100) as u8),
+        _ => Err("flow control knows whole milliseconds up to 127ms, and 100us to 900us in steps of 100us"
+            .to_owned()),
+    }
+}
+
+impl TransferArgs {
+    /// For requests of OBD-II.
+    pub fn of_obd(pair: Pair, p2: Duration, functional: bool) -> Self {
+        Self {
+            pair,
+            functional,
+            p2,
+            p2_star: Duration::from_secs(5),
+            patience: Duration::from_secs(30),
+            separation: 0,
+            block_size: 0,
+            padding: Padding(Some(0)),
+            flow_control: FlowBy::Host,
+        }
+    }
+
+    /// Who talks.
+    pub const fn pair(&self) -> Pair {
+        self.pair
+    }
+
+    fn to(&self) -> Endpoint {
+        let functional = |id| Endpoint { id, address: None };
+        match (self.functional, self.pair.a.id.is_extended()) {
+            (false, _) => self.pair.a,
+            (true, false) => functional(Id::standard_truncated(0x7DF)),
+            (true, true) => functional(Id::extended_truncated(0x18DB_33F1)),
+        }
+    }
+
+    fn answerer(&self) -> Answerer {
+        match (self.functional, self.pair.a.id.is_extended()) {
+            (false, _) => Answerer::One { from: self.pair.b, flow_to: self.pair.a },
+            (true, false) => Answerer::Any11Bit,
+            (true, true) => Answerer::Any29Bit { tester: 0xF1 },
+        }
+    }
+
+    /// The request as a client.
+    fn exchange(&self, request: &[u8]) -> Exchange {
+        let ns = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX / 4).min(u64::MAX / 4);
+        let settings = TransferSettings {
+            padding: self.padding.0,
+            block_size: self.block_size,
+            separation: self.separation,
+            ..TransferSettings::default()
+        };
+        let timing = ResponseTiming {
+            p2_ns: ns(self.p2),
+            p2_star_ns: ns(self.p2_star),
+            patience_ns: ns(self.patience),
+        };
+        Exchange::new(self.to(), self.answerer(), request.to_vec(), settings, timing)
+    }
+}
+
+/// A refusal in words.
+pub fn refusal_text(request: &[u8], code: u8) -> String {
+    let sid = request.first().copied().unwrap_or_default();
+    let service = uds_service(sid).map_or_else(|| format!("service {sid:02X}"), str::to_owned);
+    let advice = match code {
+        0x11 | 0x7F => "; another session may know it: see --session",
+        0x12 | 0x7E => "; another session may have it: see --session",
+        0x13 => "; check how long the request has to be",
+        0x22 => "; the ECU is not in the state for it: check ignition, engine and speed",
+        0x24 => "; something has to come before it",
+        0x31 => "; the ECU has no such identifier, or not in this session",
+        0x33 => "; unlock it with --security and --key-command",
+        0x35 => "; the key is wrong: check --key-command",
+        0x36 | 0x37 => "; wait before the next try, often ten seconds or more",
+        0x21 => "; try again",
+        _ => "",
+    };
+    format!("the ECU refused {service}: {} ({code:02X}){advice}", reason(code))
+}
+
+/// Asks.
+pub struct Client<'d> {
+    pub speaking: Speaking<'d>,
+    args: TransferArgs,
+    /// The first refusal, where refusals do not end everything.
+    refused: Option<anyhow::Error>,
+}
+
+impl<'d> Client<'d> {
+    /// Over a device whose channel is open.
+    pub const fn new(speaking: Speaking<'d>, args: TransferArgs) -> Self {
+        Self { speaking, args, refused: None }
+    }
+
+    /// Asks others, or in another way.
+    pub const fn set_transfer(&mut self, args: TransferArgs) {
+        self.args = args;
+    }
+
+    fn channel(&self) -> Channel {
+        self.speaking.channel()
+    }
+
+    /// Asks, and returns the answers; refusals among them are remembered for [`Self::all_agreed`].
+    pub fn ask(&mut self, request: &[u8]) -> anyhow::Result<Vec<ServerAnswer>> {
+        self.ask_so_many(request, None).map_err(|failure| self.explain(failure))
+    }
+
+    /// As [`Self::ask`], but nobody has to answer.
+    pub fn ask_whoever(
+        &mut self,
+        request: &[u8],
+        servers: Option<usize>,
+    ) -> anyhow::Result<Vec<ServerAnswer>> {
+        match self.ask_so_many(request, servers) {
+            Ok(answers) => Ok(answers),
+            Err(Failure::Exchange(ExchangeError::NoAnswer { .. })) => Ok(Vec::new()),
+            Err(failure) => Err(self.explain(failure)),
+        }
+    }
+
+    /// Says something that no answer is wanted to, and does not wait for a refusal.
+    pub fn tell_only(&mut self, request: &[u8]) -> anyhow::Result<()> {
+        let p2 = std::mem::replace(&mut self.args.p2, Duration::from_millis(50));
+        let told = self.ask(request);
+        self.args.p2 = p2;
+        told.map(|_| ())
+    }
+
+    fn ask_so_many(&mut self, request: &[u8], servers: Option<usize>) -> Result<Vec<ServerAnswer>, Failure> {
+        let mut exchange = self.args.exchange(request);
+        if let Some(servers) = servers {
+            exchange.expect(servers);
+        }
+        let reply = exchange.device_reply().filter(|_| self.args.flow_control == FlowBy::Device);
+        if let Some((from, reply)) = reply {
+            let extended = from.id.is_extended();
+            let mask = if extended { Id::MAX_EXTENDED } else { Id::MAX_STANDARD };
+            let filter = Filter { extended, kind: FrameKind::Data, id: from.id.raw(), mask };
+            let entry = Some(Trigger { filter, reply, count: 1 });
+            self.speaking
+                .device()
+                .set_trigger(self.channel(), FLOW_SLOT, entry)
+                .map_err(|error| Failure::Other(error.into()))?;
+            exchange.flow_by_device();
+        }
+        let ran = self.speaking.run(&mut exchange);
+        if reply.is_some() {
+            let cleared = self.speaking.device().set_trigger(self.channel(), FLOW_SLOT, None);
+            cleared.map_err(|error| Failure::Other(error.into()))?;
+        }
+        ran.map_err(Failure::Other)?;
+        let (answers, broken) = exchange.finish().map_err(Failure::Exchange)?;
+        for (from, error) in broken {
+            eprintln!("cantap: the answer of {from} broke off: {error}");
+        }
+        let refusal = answers.iter().find_map(ServerAnswer::refusal);
+        if let Some(code) = refusal {
+            self.refused.get_or_insert_with(|| anyhow!(refusal_text(request, code)));
+        }
+        Ok(answers)
+    }
+
+    /// An error if anything was refused.
+    pub fn all_agreed(&mut self) -> anyhow::Result<()> {
+        self.refused.take().map_or(Ok(()), Err)
+    }
+
+    fn explain(&self, failure: Failure) -> anyhow::Error {
+        let error = match failure {
+            Failure::Other(error) => return error,
+            Failure::Exchange(error) => error,
+        };
+        let asked = self.args.to();
+        match error {
+            ExchangeError::NoAnswer { others, .. } => {
+                let others = match others {
+                    0 => String::new(),
+                    others => format!("; {others} messages came that answer something else"),
+                };
+                anyhow!(
+                    "{asked}: {error}; {}{others}; check that the ECU is awake (ignition), the bit rate, and --pair",
+                    self.speaking.circumstances()
+                )
+            }
+            ExchangeError::Request(_) => {
+                anyhow!("{asked}: {error}; {}; check --pair", self.speaking.circumstances())
+            }
+            _ => anyhow!("{asked}: {error}"),
+        }
+    }
+}
+
+enum Failure {
+    Exchange(ExchangeError),
+    Other(anyhow::Error),
+}
+
+/// For callers that need at least one.
+pub fn first(answers: Vec<ServerAnswer>) -> anyhow::Result<ServerAnswer> {
+    match answers.into_iter().next() {
+        Some(answer) => Ok(answer),
+        None => bail!("nobody answered"),
+    }
+}

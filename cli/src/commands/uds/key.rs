@@ -1,0 +1,70 @@
+//! Security access: the ECU's seed goes to the user's command, whose key goes to the ECU.
+
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::process::{Command, Stdio};
+
+use anyhow::{Context, bail, ensure};
+
+use super::client::{Client, first};
+
+/// How to unlock the ECU; for commands to flatten into theirs.
+#[derive(clap::Args, Clone)]
+pub struct KeyArgs {
+    /// Then unlock the ECU at this level: an odd number in hexadecimal, as 1, which needs --key-command.
+    #[arg(long, value_name = "LEVEL", value_parser = level, requires = "key_command", global = true)]
+    security: Option<u8>,
+    /// A command that makes the key: it gets the seed in hexadecimal on standard input, and in place of {seed}, and prints the key in
+    /// hexadecimal.
+    #[arg(long, value_name = "COMMAND", global = true)]
+    key_command: Option<String>,
+}
+
+fn level(text: &str) -> Result<u8, String> {
+    let level = super::byte(text).ok().filter(|level| level % 2 == 1 && *level < 0x7F);
+    level.ok_or_else(|| "levels are odd numbers from 1 to 7D, in hexadecimal".to_owned())
+}
+
+impl KeyArgs {
+    /// Unlocks it, if that was asked for.
+    pub fn unlock(&self, client: &mut Client<'_>) -> anyhow::Result<()> {
+        let (Some(level), Some(command)) = (self.security, &self.key_command) else { return Ok(()) };
+        let answer = first(client.ask(&[0x27, level])?)?;
+        client.all_agreed()?;
+        let seed = answer.data.get(2..).unwrap_or_default();
+        // An ECU that is unlocked says so by a seed of zeros (ISO 14229-1).
+        if seed.iter().all(|byte| *byte == 0) {
+            return Ok(());
+        }
+        let key = key(command, seed)?;
+        client.ask(&[&[0x27, level + 1][..], &key].concat())?;
+        client.all_agreed()
+    }
+}
+
+fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
+    let seed = seed.iter().fold(String::new(), |mut text, byte| {
+        let _ = write!(text, "{byte:02X}");
+        text
+    });
+    let line = command.replace("{seed}", &seed);
+    let mut shell = if cfg!(windows) { Command::new("cmd") } else { Command::new("sh") };
+    shell.args([if cfg!(windows) { "/C" } else { "-c" }, &line]).stdin(Stdio::piped()).stdout(Stdio::piped());
+    let mut child = shell.spawn().context("cannot run the shell for --key-command")?;
+    if let Some(mut stdin) = child.stdin.take() {
+        // A command that takes the seed from its line may not read.
+        let _ = writeln!(stdin, "{seed}");
+    }
+    let output = child.wait_with_output().context("cannot read from --key-command")?;
+    ensure!(output.status.success(), "--key-command '{command}' failed: {}; no key was sent", output.status);
+    let text = String::from_utf8_lossy(&output.stdout);
+    match super::bytes(text.trim()) {
+        Ok(super::Hex(key)) => Ok(key),
+        Err(_) => {
+            bail!(
+                "--key-command '{command}' printed '{}', which is no key in hexadecimal; no key was sent",
+                text.trim()
+            )
+        }
+    }
+}

@@ -1,0 +1,336 @@
+//! Commands that talk with nodes: they open a channel in normal mode, connect a client (a [`Machine`]) to the device, and show what
+//! really was on the bus, as `conversations` would.
+
+use std::collections::VecDeque;
+use std::fmt::Write as _;
+use std::io::Write as _;
+use std::time::{Duration, Instant};
+
+use anyhow::{anyhow, bail};
+use cantap::device::Records;
+use cantap::transmit::Stream;
+use cantap::wire::message::{Mode, Periodic};
+use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
+use cantap_protocols::active::Machine;
+use cantap_protocols::{Assembler, Event};
+
+use crate::address::{Address, OpenDevice};
+use crate::boards::the_one_connected;
+use crate::channel_args::ChannelArgs;
+use crate::channel_bitrate::ChannelBitrate;
+use crate::commands::conversations;
+use crate::completion;
+use crate::sending::Sending;
+use crate::words::{counted, state_name};
+use crate::wrong::wrong;
+use crate::{args, interrupt};
+
+/// The longest time between two looks at what is being sent, and at Ctrl-C.
+const LOOK_EVERY: Duration = Duration::from_millis(20);
+/// The device's slot for frames that are repeated.
+const REPEAT_SLOT: u8 = 0;
+
+/// Where to talk; for commands to flatten into theirs.
+#[derive(clap::Args)]
+pub struct SpeakArgs {
+    /// Where the device is: a serial port, or virtual. Without it, the board that is connected, if there is one.
+    #[arg(short, long, global = true, add = completion::devices())]
+    device: Option<Address>,
+    /// The channel to talk on: 1 or 2.
+    #[arg(short, long, global = true, default_value = "1", value_parser = args::channel, add = completion::channels())]
+    channel: Channel,
+    /// Bit rate of the bus in bit/s: 500000, 500k, 1M. Without it, the one saved on the device.
+    #[arg(short, long = "bitrate", value_name = "[CHANNEL:]RATE", global = true, add = completion::bit_rates())]
+    bitrates: Vec<ChannelBitrate>,
+    /// Print one JSON object per line.
+    #[arg(long, global = true)]
+    pub json: bool,
+}
+
+impl SpeakArgs {
+    /// Begins a session with the device, and opens the channel: it acknowledges from now on, and sends what it is told to.
+    pub fn open(&self) -> anyhow::Result<OpenDevice> {
+        self.open_in(Mode::Normal)
+    }
+
+    /// The channel.
+    pub const fn channel(&self) -> Channel {
+        self.channel
+    }
+
+    /// As [`Self::open`], but the channel only listens.
+    pub fn listen(&self) -> anyhow::Result<OpenDevice> {
+        self.open_in(Mode::ListenOnly)
+    }
+
+    fn open_in(&self, mode: Mode) -> anyhow::Result<OpenDevice> {
+        interrupt::watch()?;
+        let device = self.device.clone().map_or_else(the_one_connected, Ok)?.open()?;
+        self.channel_args().open(&device, [self.channel].into_iter(), mode, None)?;
+        Ok(device)
+    }
+
+    fn channel_args(&self) -> ChannelArgs {
+        ChannelArgs::listening(self.bitrates.clone())
+    }
+
+    /// Talks over the device.
+    pub fn speak<'d>(&self, device: &'d OpenDevice, witness: Box<dyn Assembler>) -> Speaking<'d> {
+        let open = device.open_channels().into_iter().find(|(channel, _)| *channel == self.channel);
+        let clock_hz = device.hello().can_clock_hz;
+        Speaking {
+            device,
+            channel: self.channel,
+            bitrate_bps: open.map_or(1, |(_, config)| config.timing.bitrate_bps(clock_hz)),
+            records: device.records(),
+            stream: Stream::new(device),
+            sending: Sending::fed(device, self.channel_args().rescue()),
+            started: Instant::now(),
+            pushed: 0,
+            under_way: VecDeque::new(),
+            witness,
+            events: Vec::new(),
+            heard: Heard::default(),
+            json: self.json,
+        }
+    }
+}
+
+/// What was on the bus beside our own frames, since the last question.
+#[derive(Clone, Copy, Debug, Default)]
+struct Heard {
+    since: Option<Instant>,
+    frames: u64,
+    bits: u64,
+    lost: u64,
+}
+
+/// Talks on one channel.
+pub struct Speaking<'d> {
+    device: &'d OpenDevice,
+    channel: Channel,
+    bitrate_bps: u32,
+    records: Records,
+    stream: Stream<'d>,
+    sending: Sending<'d>,
+    started: Instant,
+    pushed: u64,
+    /// Frames that were not confirmed so far.
+    under_way: VecDeque<Frame>,
+    witness: Box<dyn Assembler>,
+    events: Vec<Event>,
+    heard: Heard,
+    json: bool,
+}
+
+impl Speaking<'_> {
+    fn now_ns(&self) -> u64 {
+        self.started.elapsed().as_nanos() as u64
+    }
+
+    /// The channel.
+    pub const fn channel(&self) -> Channel {
+        self.channel
+    }
+
+    /// The device.
+    pub const fn device(&self) -> &OpenDevice {
+        self.device
+    }
+
+    /// What the reader of the bus has said since the last call.
+    pub fn take_events(&mut self) -> Vec<Event> {
+        std::mem::take(&mut self.events)
+    }
+
+    /// Takes back what [`Self::take_events`] gave.
+    pub fn put_back(&mut self, events: Vec<Event>) {
+        self.events = events;
+    }
+
+    /// Prints what the reader of the bus has said since the last call, as far as it is wanted.
+    pub fn tell(&mut self, mut is_wanted: impl FnMut(&Event) -> bool) -> anyhow::Result<()> {
+        let mut out = std::io::stdout().lock();
+        for event in self.events.drain(..).filter(|event| is_wanted(event)) {
+            conversations::write(&mut out, &event, self.json)?;
+        }
+        Ok(out.flush()?)
+    }
+
+    /// Runs a client until it ends. The error is that frames do not leave, the device is gone, or Ctrl-C; how the client fared it
+    /// says itself.
+    pub fn run(&mut self, machine: &mut dyn Machine) -> anyhow::Result<()> {
+        self.heard = Heard { since: Some(Instant::now()), ..Heard::default() };
+        self.take_records(Duration::ZERO, None)?;
+        loop {
+            let mut any = false;
+            while let Some(frame) = machine.next(self.now_ns()) {
+                self.send(frame)?;
+                any = true;
+            }
+            if any {
+                self.stream.flush()?;
+            }
+            if machine.is_done() && self.under_way.is_empty() {
+                return self.look();
+            }
+            let wait = machine.due_ns().filter(|_| !machine.is_done()).map_or(LOOK_EVERY, |due_ns| {
+                Duration::from_nanos(due_ns.saturating_sub(self.now_ns())).min(LOOK_EVERY)
+            });
+            self.take_records(wait, Some(machine))?;
+            self.look()?;
+        }
+    }
+
+    /// Has the device send frames again and again by its own clock, until as many as wanted, the end of the time, or Ctrl-C. Returns
+    /// how many were sent.
+    pub fn repeat(
+        &mut self,
+        frame: Frame,
+        period: Duration,
+        count: Option<u32>,
+        time: Option<Duration>,
+    ) -> anyhow::Result<u64> {
+        let period_ticks = periodic::period_ticks(period, self.device.hello().tick_hz)
+            .map_err(|error| wrong(error.to_string()))?;
+        let entry =
+            Periodic { frame, period_ticks, count: count.unwrap_or(0), modifiers: heapless::Vec::new() };
+        let started = Instant::now();
+        let before = self.sending.sent();
+        self.device.set_periodic(self.channel, REPEAT_SLOT, Some(entry))?;
+        loop {
+            self.take_records(LOOK_EVERY, None)?;
+            self.stream.wait(Duration::ZERO)?;
+            let ends = self.stream.take_ended();
+            let goes_on = self.sending.device_goes_on(&ends);
+            let sent = self.sending.sent() - before;
+            let is_over = interrupt::requested()
+                || time.is_some_and(|time| started.elapsed() >= time)
+                || count.is_some_and(|count| sent >= u64::from(count));
+            if is_over {
+                self.device.set_periodic(self.channel, REPEAT_SLOT, None)?;
+                return Ok(sent);
+            }
+            if !goes_on {
+                self.pushed = self.sending.ended() + 1;
+                return Err(self.stopped());
+            }
+        }
+    }
+
+    /// Only listens, and lets the reader of the bus read.
+    pub fn listen(&mut self, time: Duration) -> anyhow::Result<()> {
+        let until = Instant::now() + time;
+        loop {
+            let left = until.saturating_duration_since(Instant::now());
+            self.take_records(left.min(LOOK_EVERY), None)?;
+            if left.is_zero() || interrupt::requested() {
+                return Ok(());
+            }
+        }
+    }
+
+    fn send(&mut self, frame: Frame) -> anyhow::Result<()> {
+        self.under_way.push_back(frame);
+        self.pushed += 1;
+        let sending = &mut self.sending;
+        let tag = self.stream.push(self.channel, frame, None, |stream| {
+            sending.goes_on(&stream.take_ended(), stream.oldest_due())
+        })?;
+        match tag {
+            Some(_) => Ok(()),
+            None => Err(self.stopped()),
+        }
+    }
+
+    fn take_records(&mut self, wait: Duration, mut machine: Option<&mut dyn Machine>) -> anyhow::Result<()> {
+        let Some(batch) = self.records.next_batch(wait)? else {
+            bail!("the device ended the session");
+        };
+        self.sending.take(&batch);
+        for record in &batch {
+            if record.channel == self.channel.number() {
+                let machine = machine.as_mut().map(|machine| &mut **machine as &mut dyn Machine);
+                self.record(record, machine);
+            }
+        }
+        self.records.recycle(batch);
+        Ok(())
+    }
+
+    fn record(&mut self, record: &TraceRecord, machine: Option<&mut dyn Machine>) {
+        self.witness.take(record, &mut self.events);
+        let now_ns = self.now_ns();
+        match record.event {
+            TraceEvent::Frame { frame, .. } => {
+                // On a shared board, other programs' frames are sent from here as well.
+                if let Some(place) = self.under_way.iter().position(|own| frame == *own) {
+                    self.under_way.remove(place);
+                    if let Some(machine) = machine {
+                        machine.sent(now_ns);
+                    }
+                    return;
+                }
+                self.heard.frames += 1;
+                self.heard.bits += u64::from(frame.bus_bits().total());
+                if let Some(machine) = machine.filter(|_| !frame.is_remote()) {
+                    machine.hear(now_ns, frame.id(), frame.data());
+                }
+            }
+            TraceEvent::Lost { count, .. } => {
+                self.heard.lost += u64::from(count);
+                if let Some(machine) = machine {
+                    machine.gap(now_ns);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether everything that was to be sent leaves.
+    fn look(&mut self) -> anyhow::Result<()> {
+        self.stream.wait(Duration::ZERO)?;
+        let goes_on = self.sending.goes_on(&self.stream.take_ended(), self.stream.oldest_due());
+        if goes_on && self.sending.ended() == self.sending.sent() { Ok(()) } else { Err(self.stopped()) }
+    }
+
+    /// Why nothing more is sent.
+    fn stopped(&mut self) -> anyhow::Error {
+        if interrupt::requested() {
+            return anyhow!("ended by Ctrl-C before it was complete");
+        }
+        match self.sending.outcome(self.pushed) {
+            Ok(outcome) => {
+                outcome.verdict().err().unwrap_or_else(|| anyhow!("frames no longer leave the device"))
+            }
+            Err(error) => error,
+        }
+    }
+
+    /// What can be said of the bus when somebody does not answer: the last question was acknowledged, and what else there was.
+    pub fn circumstances(&self) -> String {
+        let Heard { since, frames, bits, lost } = self.heard;
+        let seconds = since.map_or(0.0, |since| since.elapsed().as_secs_f64()).max(1e-3);
+        let load_pct = (bits as f64 / (f64::from(self.bitrate_bps) * seconds) * 100.0).min(100.0);
+        let mut text = "what was sent was acknowledged by a node".to_owned();
+        let _ = match frames {
+            0 => write!(text, "; no other frame was heard in {seconds:.1} s"),
+            frames => write!(
+                text,
+                "; {} of others in {seconds:.1} s (load {load_pct:.0} %)",
+                counted(usize::try_from(frames).unwrap_or(usize::MAX), "frame")
+            ),
+        };
+        if let Ok(status) = self.device.status() {
+            let _ = write!(
+                text,
+                "; the controller is {}",
+                state_name(status.channels[self.channel.index()].state)
+            );
+        }
+        if lost > 0 {
+            let _ = write!(text, "; {lost} frames or more were lost on the way to this computer");
+        }
+        text
+    }
+}

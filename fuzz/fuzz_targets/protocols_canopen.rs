@@ -1,0 +1,11 @@
+//! The whole of CANopen, of four nodes.
+
+#![no_main]
+
+use cantap_fuzz::read;
+use cantap_protocols::Protocol;
+use cantap_wire::Id;
+
+libfuzzer_sys::fuzz_target!(|frames: Vec<(u32, u16, Vec<u8>)>| {
+    read(Protocol::CanOpen, &frames, |number| Id::standard_truncated(number & 0x783));
+});

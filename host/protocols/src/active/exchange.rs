@@ -1,0 +1,441 @@
+//! A diagnostic request and its answers: UDS (ISO 14229), KWP2000 and OBD-II, over ISO 15765-2.
+//!
+//! One server is asked by its own identifier, all of them by a functional one. A server that needs longer says so again and again
+//! (response pending); how long that may go on is bounded.
+
+use std::collections::VecDeque;
+
+use cantap_trace::Id;
+use cantap_wire::Frame;
+
+use super::transfer::{TransferError, TransferReceiver, TransferSender, TransferSettings};
+use super::{Machine, earlier};
+use crate::diagnostics::{has_sub_function, is_response_suppressed};
+use crate::iso_tp::{Endpoint, Pci, parse};
+
+const NEGATIVE: u8 = 0x7F;
+const RESPONSE_PENDING: u8 = 0x78;
+
+/// How long servers may take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ResponseTiming {
+    /// From the end of the request to the beginning of the answer (P2, with what the network takes).
+    pub p2_ns: u64,
+    /// The same after the server has said that the answer is pending (P2*).
+    pub p2_star_ns: u64,
+    /// From the end of the request to the last answer, however often it is pending.
+    pub patience_ns: u64,
+}
+
+impl Default for ResponseTiming {
+    /// A second, for servers have 50 ms and gateways take their time; five seconds; a minute.
+    fn default() -> Self {
+        Self { p2_ns: 1_000_000_000, p2_star_ns: 5_000_000_000, patience_ns: 60_000_000_000 }
+    }
+}
+
+/// Who is to answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answerer {
+    /// One server; flow control goes where the request does, or, for a functional request, to its own identifier.
+    One {
+        /// What it answers with.
+        from: Endpoint,
+        /// What it is asked with.
+        flow_to: Endpoint,
+    },
+    /// Whoever answers with 7E8 to 7EF (ISO 15765-4).
+    Any11Bit,
+    /// Whoever answers this tester with 18DA (ISO 15765-4).
+    Any29Bit {
+        /// The tester's address, F1 as a rule.
+        tester: u8,
+    },
+}
+
+impl Answerer {
+    /// Where flow control for this sender goes, if it is one that is to answer.
+    fn flow_to(self, id: Id, data: &[u8]) -> Option<(Endpoint, Endpoint)> {
+        let plain = |id| Endpoint { id, address: None };
+        match self {
+            Self::One { from, flow_to } => {
+                let is_it =
+                    id == from.id && from.address.is_none_or(|address| data.first() == Some(&address));
+                is_it.then_some((from, flow_to))
+            }
+            Self::Any11Bit => {
+                let is_one = !id.is_extended() && (0x7E8..=0x7EF).contains(&id.raw());
+                is_one.then(|| (plain(id), plain(Id::standard_truncated(id.raw() - 8))))
+            }
+            Self::Any29Bit { tester } => {
+                let server = id.raw() & 0xFF;
+                let is_one = id.is_extended() && id.raw() & 0x3FF_FF00 == 0x0DA_0000 | u32::from(tester) << 8;
+                let back = 0x18DA_0000 | server << 8 | u32::from(tester);
+                is_one.then(|| (plain(id), plain(Id::extended_truncated(back))))
+            }
+        }
+    }
+
+    /// Whether there can be several.
+    pub const fn is_many(self) -> bool {
+        !matches!(self, Self::One { .. })
+    }
+}
+
+/// One server's answer.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct ServerAnswer {
+    /// Who.
+    pub from: Endpoint,
+    /// What; the first byte is the service's plus 40 (hexadecimal), or 7F.
+    pub data: Vec<u8>,
+    /// How often it said before that the answer is pending.
+    pub pending: u32,
+}
+
+impl ServerAnswer {
+    /// The code of a refusal.
+    pub fn refusal(&self) -> Option<u8> {
+        match self.data[..] {
+            [NEGATIVE, _, code, ..] => Some(code),
+            _ => None,
+        }
+    }
+}
+
+/// Answers, and whose answers broke off.
+pub type Answers = (Vec<ServerAnswer>, Vec<(Endpoint, TransferError)>);
+
+/// Why there is no answer.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum ExchangeError {
+    /// The request did not get through.
+    #[error("the request broke off: {0}")]
+    Request(TransferError),
+    /// Nothing came.
+    #[error("no answer within {after_ms} ms")]
+    NoAnswer {
+        /// How long was waited.
+        after_ms: u64,
+        /// Messages of those asked that answer something else.
+        others: u32,
+    },
+    /// The server said that the answer is pending, and then nothing.
+    #[error("the server said {times} times that its answer is pending, and then nothing for {after_ms} ms")]
+    NothingAfterPending {
+        /// How often.
+        times: u32,
+        /// How long was waited.
+        after_ms: u64,
+    },
+    /// The server goes on saying that its answer is pending.
+    #[error("the server has said for {seconds} s that its answer is pending ({times} times)")]
+    EndlessPending {
+        /// How often.
+        times: u32,
+        /// How long.
+        seconds: u64,
+    },
+    /// The answer broke off.
+    #[error("the answer of {from} broke off: {error}")]
+    Answer {
+        /// Whose.
+        from: Endpoint,
+        /// How.
+        error: TransferError,
+    },
+}
+
+/// One that answers, or has begun to.
+#[derive(Debug)]
+struct Server {
+    from: Endpoint,
+    receiver: TransferReceiver,
+    pending: u32,
+    /// An answer that was said to be pending is waited for until then.
+    pending_until_ns: Option<u64>,
+}
+
+/// One request to one or to many.
+#[derive(Debug)]
+pub struct Exchange {
+    request: Vec<u8>,
+    sender: TransferSender,
+    answerer: Answerer,
+    settings: TransferSettings,
+    timing: ResponseTiming,
+    flow_by_device: bool,
+    most_answers: Option<usize>,
+    servers: Vec<Server>,
+    answers: Vec<ServerAnswer>,
+    broken: Vec<(Endpoint, TransferError)>,
+    /// Frames handed over that were not on the bus yet; whether each is of the request.
+    under_way: VecDeque<bool>,
+    /// When the request was on the bus.
+    asked_ns: Option<u64>,
+    others: u32,
+    end: Option<Result<(), ExchangeError>>,
+}
+
+impl Exchange {
+    /// A request of at least one byte.
+    pub fn new(
+        to: Endpoint,
+        answerer: Answerer,
+        request: Vec<u8>,
+        settings: TransferSettings,
+        timing: ResponseTiming,
+    ) -> Self {
+        Self {
+            sender: TransferSender::new(to, request.clone(), settings),
+            request,
+            answerer,
+            settings,
+            timing,
+            flow_by_device: false,
+            most_answers: None,
+            servers: Vec::new(),
+            answers: Vec::new(),
+            broken: Vec::new(),
+            under_way: VecDeque::new(),
+            asked_ns: None,
+            others: 0,
+            end: None,
+        }
+    }
+
+    /// Ends as soon as so many servers have answered, where many are asked.
+    pub const fn expect(&mut self, servers: usize) {
+        self.most_answers = Some(servers);
+    }
+
+    /// The device sends the first flow control frame by itself: see [`TransferReceiver::new`].
+    pub const fn flow_by_device(&mut self) {
+        self.flow_by_device = true;
+    }
+
+    /// What the device is to reply with then, if one server is asked.
+    pub fn device_reply(&self) -> Option<(Endpoint, Frame)> {
+        match self.answerer {
+            Answerer::One { from, flow_to } => Some((from, TransferReceiver::go_on(flow_to, &self.settings))),
+            _ => None,
+        }
+    }
+
+    /// The answers, and those that broke off, if there is one that did not. To be called when it is done.
+    pub fn finish(self) -> Result<Answers, ExchangeError> {
+        match self.end {
+            Some(Err(error)) => Err(error),
+            _ => Ok((self.answers, self.broken)),
+        }
+    }
+
+    fn end(&mut self, result: Result<(), ExchangeError>) {
+        self.end.get_or_insert(result);
+    }
+
+    /// A server has said something whole.
+    fn answered(&mut self, now_ns: u64, place: usize, data: Vec<u8>) {
+        if !is_answer(&self.request, &data) {
+            self.others += 1;
+            return;
+        }
+        let server = &mut self.servers[place];
+        if matches!(data[..], [NEGATIVE, _, RESPONSE_PENDING, ..]) {
+            server.pending += 1;
+            server.pending_until_ns = Some(now_ns + self.timing.p2_star_ns);
+            return;
+        }
+        server.pending_until_ns = None;
+        self.answers.push(ServerAnswer { from: server.from, data, pending: server.pending });
+        if !self.answerer.is_many() || self.most_answers.is_some_and(|most| self.answers.len() >= most) {
+            self.end(Ok(()));
+        }
+    }
+
+    fn broke(&mut self, place: usize, error: TransferError) {
+        let server = &mut self.servers[place];
+        server.pending_until_ns = None;
+        let from = server.from;
+        self.broken.push((from, error));
+        if !self.answerer.is_many() {
+            self.end(Err(ExchangeError::Answer { from, error }));
+        }
+    }
+
+    /// What time alone decides.
+    fn expire(&mut self, now_ns: u64) {
+        let Some(asked_ns) = self.asked_ns else { return };
+        let pending: u32 = self.servers.iter().map(|server| server.pending).sum();
+        let is_receiving = self.servers.iter().any(|server| server.receiver.is_receiving());
+        if now_ns >= asked_ns + self.timing.patience_ns {
+            let seconds = self.timing.patience_ns / 1_000_000_000;
+            let has_some = !self.answers.is_empty();
+            self.end(if has_some {
+                Ok(())
+            } else {
+                Err(ExchangeError::EndlessPending { times: pending, seconds })
+            });
+            return;
+        }
+        if is_receiving {
+            return;
+        }
+        // One that was said to be pending and did not come.
+        let p2_star_ms = self.timing.p2_star_ns / 1_000_000;
+        let silent =
+            |server: &&mut Server| server.pending_until_ns.is_some_and(|until_ns| now_ns >= until_ns);
+        for server in self.servers.iter_mut().filter(silent) {
+            server.pending_until_ns = None;
+        }
+        let waits = self.servers.iter().any(|server| server.pending_until_ns.is_some());
+        if waits || now_ns < asked_ns + self.timing.p2_ns {
+            return;
+        }
+        let is_answered = !self.answers.is_empty() || pending == 0 && is_response_suppressed(&self.request);
+        self.end(match (is_answered, pending, self.broken.first()) {
+            (true, ..) => Ok(()),
+            (false, _, Some(&(from, error))) => Err(ExchangeError::Answer { from, error }),
+            (false, 0, None) => {
+                let after_ms = self.timing.p2_ns / 1_000_000;
+                Err(ExchangeError::NoAnswer { after_ms, others: self.others })
+            }
+            (false, times, None) => Err(ExchangeError::NothingAfterPending { times, after_ms: p2_star_ms }),
+        });
+    }
+}
+
+impl Machine for Exchange {
+    fn next(&mut self, now_ns: u64) -> Option<Frame> {
+        for place in 0..self.servers.len() {
+            match self.servers[place].receiver.next(now_ns) {
+                Ok(Some(flow)) => {
+                    self.under_way.push_back(false);
+                    return Some(flow);
+                }
+                Ok(None) => {}
+                Err(error) => self.broke(place, error),
+            }
+        }
+        if self.is_done() {
+            return None;
+        }
+        match self.sender.next(now_ns) {
+            Ok(Some(frame)) => {
+                self.under_way.push_back(true);
+                return Some(frame);
+            }
+            Ok(None) => {}
+            Err(error) => self.end(Err(ExchangeError::Request(error))),
+        }
+        self.expire(now_ns);
+        None
+    }
+
+    fn sent(&mut self, now_ns: u64) {
+        if self.under_way.pop_front() == Some(true) {
+            self.sender.sent(now_ns);
+            if self.sender.is_done() {
+                self.asked_ns.get_or_insert(now_ns);
+            }
+        }
+    }
+
+    fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
+        let Some((from, flow_to)) = self.answerer.flow_to(id, data) else { return };
+        // Nothing said before the request was can answer it.
+        if self.is_done()
+            || self.under_way.is_empty() && self.asked_ns.is_none() && self.sender.due_ns().is_none()
+        {
+            return;
+        }
+        let pci = match parse(data, usize::from(from.address.is_some())) {
+            Ok(Some(pci)) => pci,
+            Ok(None) => return,
+            Err(fault) => {
+                let error = TransferError::Malformed(fault);
+                self.broken.push((from, error));
+                if !self.answerer.is_many() {
+                    self.end(Err(ExchangeError::Answer { from, error }));
+                }
+                return;
+            }
+        };
+        if let Pci::Flow { status, block_size, separation_us } = pci {
+            if let Err(error) = self.sender.flow(now_ns, status, block_size, separation_us) {
+                self.end(Err(ExchangeError::Request(error)));
+            }
+            return;
+        }
+        let place = self.servers.iter().position(|server| server.from == from).unwrap_or_else(|| {
+            let receiver = TransferReceiver::new(flow_to, self.settings, self.flow_by_device);
+            self.servers.push(Server { from, receiver, pending: 0, pending_until_ns: None });
+            self.servers.len() - 1
+        });
+        match self.servers[place].receiver.take(now_ns, pci) {
+            Ok(Some(data)) => self.answered(now_ns, place, data),
+            Ok(None) => {}
+            Err(error) => self.broke(place, error),
+        }
+    }
+
+    fn gap(&mut self, _now_ns: u64) {
+        for place in 0..self.servers.len() {
+            if let Err(error) = self.servers[place].receiver.gap() {
+                self.broke(place, error);
+            }
+        }
+    }
+
+    fn due_ns(&self) -> Option<u64> {
+        let receivers = self.servers.iter().filter_map(|server| server.receiver.due_ns());
+        let due = earlier(self.sender.due_ns(), receivers.min());
+        let Some(asked_ns) = self.asked_ns else { return due };
+        let (p2, patience) = (asked_ns + self.timing.p2_ns, asked_ns + self.timing.patience_ns);
+        // What has begun has its own deadlines.
+        if self.servers.iter().any(|server| server.receiver.is_receiving()) {
+            return earlier(due, Some(patience));
+        }
+        let pending = self.servers.iter().filter_map(|server| server.pending_until_ns).max();
+        let waits = pending.map_or(p2, |pending| pending.max(p2)).min(patience);
+        earlier(due, Some(waits))
+    }
+
+    fn is_done(&self) -> bool {
+        self.end.is_some()
+    }
+}
+
+/// Whether a message answers this request and no earlier one.
+fn is_answer(request: &[u8], data: &[u8]) -> bool {
+    let (Some(&sid), Some(&first)) = (request.first(), data.first()) else { return false };
+    if first == NEGATIVE {
+        return data.get(1) == Some(&sid) && data.len() >= 3;
+    }
+    if first != sid | 0x40 {
+        return false;
+    }
+    let echoed = |from: usize, to: usize| match (request.get(from..to), data.get(from..to)) {
+        (Some(asked), Some(said)) => asked == said,
+        // A request without it is none, and its answer need not have it.
+        (None, _) => true,
+        (Some(_), None) => false,
+    };
+    match sid {
+        // The answer to several may leave some out.
+        0x01 => data.get(1).is_some_and(|pid| request[1..].contains(pid)),
+        0x02 | 0x09 => echoed(1, 2),
+        0x22 | 0x24 | 0x2E | 0x2F => echoed(1, 3),
+        0x31 => echoed(1, 4),
+        sid if has_sub_function(sid) => match (request.get(1), data.get(1)) {
+            (Some(asked), Some(said)) => said & 0x7F == asked & 0x7F,
+            (asked, _) => asked.is_none(),
+        },
+        _ => true,
+    }
+}
+
+#[cfg(test)]
+#[path = "exchange_tests.rs"]
+mod tests;

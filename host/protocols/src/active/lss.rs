@@ -1,0 +1,419 @@
+//! Layer setting services (CiA 305) as the master: finds nodes without a number, gives numbers and bit rates.
+
+use std::collections::VecDeque;
+
+use cantap_trace::Id;
+use cantap_wire::Frame;
+
+use super::Machine;
+
+/// The master's identifier.
+const REQUEST: Id = Id::standard_truncated(0x7E5);
+/// The slaves'.
+const RESPONSE: Id = Id::standard_truncated(0x7E4);
+/// After an answer, for those of other slaves, which say the same.
+const SETTLE_NS: u64 = 10_000_000;
+const IDENTIFIED: u8 = 0x4F;
+
+/// Who a node is: object 1018.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct LssAddress {
+    /// CiA's number of the maker.
+    pub vendor: u32,
+    /// The maker's number of the product.
+    pub product: u32,
+    /// Its revision.
+    pub revision: u32,
+    /// Its serial number.
+    pub serial: u32,
+}
+
+/// Why nothing came of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum LssError {
+    /// No node without a number.
+    #[error("no node without a number answers the fast scan")]
+    Nobody,
+    /// It answered at the beginning, and then not when it should have.
+    #[error(
+        "the node answered the fast scan, and then did not confirm part {part} of its address; try again with a longer --timeout"
+    )]
+    Unsteady {
+        /// Which of vendor, product, revision, serial number, from 1.
+        part: u8,
+    },
+    /// No answer to a command.
+    #[error("no answer to the command {command:02X} within {after_ms} ms")]
+    NoAnswer {
+        /// The command specifier.
+        command: u8,
+        /// How long was waited.
+        after_ms: u64,
+    },
+    /// The node refused.
+    #[error("the node refused the command {command:02X}: {}", refusal(*command, *error))]
+    Refused {
+        /// The command specifier.
+        command: u8,
+        /// Its reason.
+        error: u8,
+    },
+}
+
+const fn refusal(command: u8, error: u8) -> &'static str {
+    match (command, error) {
+        (0x11, 1) => "the number is out of range",
+        (0x13, 1) => "it has no such bit rate",
+        (0x17, 1) => "it cannot store",
+        (0x17, 2) => "it cannot reach its storage",
+        (_, 0xFF) => "a reason of its own",
+        _ => "a reserved reason",
+    }
+}
+
+fn frame(bytes: [u8; 8]) -> Frame {
+    Frame::from_bus(REQUEST, false, 8, bytes)
+}
+
+/// A question that is being asked.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Asking {
+    /// Not yet.
+    Pending,
+    /// The frame was handed over.
+    Sent,
+    /// Until then, an answer counts.
+    Waits { until_ns: u64 },
+    /// It was answered; until then, others may answer the same.
+    Settles { until_ns: u64 },
+}
+
+/// Finds one node that has no number, by halving (CiA 305).
+#[derive(Debug)]
+pub struct FastScan {
+    timeout_ns: u64,
+    asking: Asking,
+    found: [u32; 4],
+    /// 128 is the question whether there is anybody; then 31 to 0; -1 confirms the part.
+    bit: i16,
+    part: u8,
+    has_answer: bool,
+    end: Option<Result<(), LssError>>,
+}
+
+impl FastScan {
+    /// Waits so long for the answer to each question. There are up to 133.
+    pub const fn new(timeout_ns: u64) -> Self {
+        Self {
+            timeout_ns,
+            asking: Asking::Pending,
+            found: [0; 4],
+            bit: 128,
+            part: 0,
+            has_answer: false,
+            end: None,
+        }
+    }
+
+    /// Who was found; it waits for commands now, as the only one. To be called when it is done.
+    pub fn finish(self) -> Result<LssAddress, LssError> {
+        let [vendor, product, revision, serial] = self.found;
+        self.end.unwrap_or(Err(LssError::Nobody)).map(|()| LssAddress { vendor, product, revision, serial })
+    }
+
+    fn question(&self) -> [u8; 8] {
+        let [a, b, c, d] = self.found[usize::from(self.part)].to_le_bytes();
+        let (bit, next) = match self.bit {
+            -1 => (0, (self.part + 1) & 3),
+            bit => (bit as u8, self.part),
+        };
+        [0x51, a, b, c, d, bit, self.part, next]
+    }
+
+    /// What the answer, or its absence, means.
+    fn conclude(&mut self) {
+        let answered = std::mem::take(&mut self.has_answer);
+        self.asking = Asking::Pending;
+        match self.bit {
+            128 if answered => self.bit = 31,
+            128 => self.end = Some(Err(LssError::Nobody)),
+            -1 if !answered => self.end = Some(Err(LssError::Unsteady { part: self.part + 1 })),
+            -1 if self.part == 3 => self.end = Some(Ok(())),
+            -1 => (self.part, self.bit) = (self.part + 1, 31),
+            bit => {
+                if !answered {
+                    self.found[usize::from(self.part)] |= 1 << bit;
+                }
+                self.bit -= 1;
+            }
+        }
+    }
+}
+
+impl Machine for FastScan {
+    fn next(&mut self, now_ns: u64) -> Option<Frame> {
+        match self.asking {
+            Asking::Waits { until_ns } | Asking::Settles { until_ns } if now_ns >= until_ns => {
+                self.conclude();
+            }
+            _ => {}
+        }
+        if self.is_done() || self.asking != Asking::Pending {
+            return None;
+        }
+        self.asking = Asking::Sent;
+        Some(frame(self.question()))
+    }
+
+    fn sent(&mut self, now_ns: u64) {
+        if self.asking == Asking::Sent {
+            self.asking = Asking::Waits { until_ns: now_ns + self.timeout_ns };
+        }
+    }
+
+    fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
+        if id == RESPONSE && data.first() == Some(&IDENTIFIED) && matches!(self.asking, Asking::Waits { .. })
+        {
+            self.has_answer = true;
+            self.asking = Asking::Settles { until_ns: now_ns + SETTLE_NS };
+        }
+    }
+
+    fn gap(&mut self, _now_ns: u64) {
+        // An answer that was lost makes a wrong bit, which the part's confirmation finds.
+    }
+
+    fn due_ns(&self) -> Option<u64> {
+        match self.asking {
+            Asking::Waits { until_ns } | Asking::Settles { until_ns } => Some(until_ns),
+            Asking::Pending | Asking::Sent => None,
+        }
+    }
+
+    fn is_done(&self) -> bool {
+        self.end.is_some()
+    }
+}
+
+/// What to tell a node that waits for commands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum LssOrder {
+    /// All nodes: wait for commands (true), or work as usual.
+    SwitchAll(bool),
+    /// The node of this address: wait for commands.
+    Switch(LssAddress),
+    /// Take this number, 1 to 127; 255 for none.
+    SetNode(u8),
+    /// Take this bit rate: its index in CiA's table.
+    SetBitRate(u8),
+    /// Keep both over a restart.
+    Store,
+}
+
+/// The index of a bit rate in CiA's table (CiA 305).
+pub const fn bit_rate_index(bitrate_bps: u32) -> Option<u8> {
+    Some(match bitrate_bps {
+        1_000_000 => 0,
+        800_000 => 1,
+        500_000 => 2,
+        250_000 => 3,
+        125_000 => 4,
+        50_000 => 6,
+        20_000 => 7,
+        10_000 => 8,
+        _ => return None,
+    })
+}
+
+/// Gives one order.
+#[derive(Debug)]
+pub struct LssMaster {
+    timeout_ns: u64,
+    out: VecDeque<[u8; 8]>,
+    under_way: usize,
+    /// The command specifier of the answer, if there is to be one.
+    answer: Option<u8>,
+    until_ns: Option<u64>,
+    end: Option<Result<(), LssError>>,
+}
+
+impl LssMaster {
+    /// Waits so long for the answer, where the order has one.
+    pub fn new(order: LssOrder, timeout_ns: u64) -> Self {
+        let command = |command: u8, rest: [u8; 2]| [command, rest[0], rest[1], 0, 0, 0, 0, 0];
+        let word = |command: u8, word: u32| {
+            let [a, b, c, d] = word.to_le_bytes();
+            [command, a, b, c, d, 0, 0, 0]
+        };
+        let (out, answer) = match order {
+            LssOrder::SwitchAll(waits) => (vec![command(0x04, [u8::from(waits), 0])], None),
+            LssOrder::Switch(LssAddress { vendor, product, revision, serial }) => {
+                let parts = [vendor, product, revision, serial];
+                ((0x40..).zip(parts).map(|(specifier, part)| word(specifier, part)).collect(), Some(0x44))
+            }
+            LssOrder::SetNode(node) => (vec![command(0x11, [node, 0])], Some(0x11)),
+            LssOrder::SetBitRate(index) => (vec![command(0x13, [0, index])], Some(0x13)),
+            LssOrder::Store => (vec![command(0x17, [0, 0])], Some(0x17)),
+        };
+        Self { timeout_ns, out: out.into(), under_way: 0, answer, until_ns: None, end: None }
+    }
+
+    /// How it went. To be called when it is done.
+    pub fn finish(self) -> Result<(), LssError> {
+        self.end.unwrap_or(Ok(()))
+    }
+}
+
+impl Machine for LssMaster {
+    fn next(&mut self, now_ns: u64) -> Option<Frame> {
+        if let (Some(until_ns), Some(command)) = (self.until_ns, self.answer)
+            && now_ns >= until_ns
+        {
+            self.end
+                .get_or_insert(Err(LssError::NoAnswer { command, after_ms: self.timeout_ns / 1_000_000 }));
+        }
+        if self.is_done() {
+            return None;
+        }
+        let bytes = self.out.pop_front()?;
+        self.under_way += 1;
+        Some(frame(bytes))
+    }
+
+    fn sent(&mut self, now_ns: u64) {
+        self.under_way = self.under_way.saturating_sub(1);
+        if self.under_way == 0 && self.out.is_empty() {
+            match self.answer {
+                Some(_) => self.until_ns = Some(now_ns + self.timeout_ns),
+                None => self.end = Some(Ok(())),
+            }
+        }
+    }
+
+    fn hear(&mut self, _now_ns: u64, id: Id, data: &[u8]) {
+        let Some(command) = self.answer.filter(|answer| id == RESPONSE && data.first() == Some(answer))
+        else {
+            return;
+        };
+        let error = if command == 0x44 { 0 } else { data.get(1).copied().unwrap_or_default() };
+        self.end.get_or_insert(if error == 0 { Ok(()) } else { Err(LssError::Refused { command, error }) });
+    }
+
+    fn gap(&mut self, _now_ns: u64) {}
+
+    fn due_ns(&self) -> Option<u64> {
+        self.until_ns
+    }
+
+    fn is_done(&self) -> bool {
+        self.end.is_some()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::active::testing::{Fate, Say, arrives, disturbed, run};
+
+    const MS: u64 = 1_000_000;
+
+    /// Slaves by CiA 305: each is where it has come to, or out of the scan.
+    fn slaves(addresses: &[[u32; 4]]) -> impl FnMut(Id, &[u8], &mut Say) {
+        let mut slaves: Vec<([u32; 4], u8)> = addresses.iter().map(|address| (*address, 0)).collect();
+        move |id, data, say| {
+            assert_eq!(id, REQUEST);
+            let &[0x51, a, b, c, d, bit, part, next] = data else { return };
+            let asked = u32::from_le_bytes([a, b, c, d]);
+            for (after, (address, at)) in (1..).zip(&mut slaves) {
+                let is_it = if bit == 0x80 {
+                    *at = 0;
+                    true
+                } else {
+                    part == *at && (address[usize::from(part)] ^ asked) >> bit == 0
+                };
+                if is_it {
+                    *at = if bit == 0 && next != part { next } else { *at };
+                    let mut answer = [0; 8];
+                    answer[0] = IDENTIFIED;
+                    say.push((after * MS, Frame::from_bus(RESPONSE, false, 8, answer)));
+                }
+            }
+        }
+    }
+
+    fn scan(addresses: &[[u32; 4]]) -> Result<LssAddress, LssError> {
+        let mut scan = FastScan::new(50 * MS);
+        let (_, sent) = run(&mut scan, &mut slaves(addresses), arrives);
+        assert!(sent.len() <= 133, "{}", sent.len());
+        scan.finish()
+    }
+
+    #[test]
+    fn a_node_is_found_by_halving() {
+        let address =
+            |[vendor, product, revision, serial]: [u32; 4]| LssAddress { vendor, product, revision, serial };
+        let one = [0x1234_5678, 0, 0xFFFF_FFFF, 0x8000_0001];
+        assert_eq!(scan(&[one]), Ok(address(one)));
+        assert_eq!(scan(&[[0; 4]]), Ok(address([0; 4])));
+        // Of several, the one with the lowest address.
+        let two = [0x1234_5678, 0, 0xFFFF_FFFF, 0x8000_0000];
+        assert_eq!(scan(&[one, two]), Ok(address(two)));
+        assert_eq!(scan(&[]), Err(LssError::Nobody));
+    }
+
+    /// An answer that is lost may not make another address.
+    #[test]
+    fn what_is_disturbed_is_not_found_wrong() {
+        let mut random = fastrand::Rng::with_seed(305);
+        let mut failed = 0;
+        for _ in 0..200 {
+            let address = [random.u32(..), random.u32(..), random.u32(..), random.u32(..)];
+            let mut scan = FastScan::new(50 * MS);
+            let mut disturb = disturbed(&mut random, 40);
+            // Doubled and late answers come within the time that others have to say the same.
+            let fate = || match disturb() {
+                Fate::Lost => Fate::Lost,
+                _ => Fate::Arrives,
+            };
+            run(&mut scan, &mut slaves(&[address]), fate);
+            match scan.finish() {
+                Ok(found) => {
+                    assert_eq!([found.vendor, found.product, found.revision, found.serial], address);
+                }
+                Err(_) => failed += 1,
+            }
+        }
+        assert!((20..190).contains(&failed), "{failed}");
+    }
+
+    #[test]
+    fn orders_are_answered_refused_or_not_answered() {
+        let order = |order: LssOrder, answer: Option<[u8; 8]>| {
+            let mut master = LssMaster::new(order, 100 * MS);
+            let mut sent_last = 0;
+            let mut peer = |_: Id, data: &[u8], say: &mut Say| {
+                sent_last = data[0];
+                if let Some(answer) = answer.filter(|_| matches!(data[0], 0x11 | 0x13 | 0x17 | 0x43)) {
+                    say.push((MS, Frame::from_bus(RESPONSE, false, 8, answer)));
+                }
+            };
+            let (_, sent) = run(&mut master, &mut peer, arrives);
+            (master.finish(), sent.iter().map(ToString::to_string).collect::<Vec<_>>())
+        };
+        let (ended, sent) = order(LssOrder::SetNode(5), Some([0x11, 0, 0, 0, 0, 0, 0, 0]));
+        assert_eq!((ended, &sent[..]), (Ok(()), &["7E5#1105000000000000".to_owned()][..]));
+        let (ended, _) = order(LssOrder::SetBitRate(2), Some([0x13, 1, 0, 0, 0, 0, 0, 0]));
+        assert_eq!(
+            ended.unwrap_err().to_string(),
+            "the node refused the command 13: it has no such bit rate"
+        );
+        let (ended, _) = order(LssOrder::Store, None);
+        assert_eq!(ended, Err(LssError::NoAnswer { command: 0x17, after_ms: 100 }));
+        let (ended, sent) = order(LssOrder::SwitchAll(false), None);
+        assert_eq!((ended, &sent[..]), (Ok(()), &["7E5#0400000000000000".to_owned()][..]));
+        let address = LssAddress { vendor: 1, product: 2, revision: 3, serial: 4 };
+        let (ended, sent) = order(LssOrder::Switch(address), Some([0x44, 0, 0, 0, 0, 0, 0, 0]));
+        assert_eq!((ended, sent.len()), (Ok(()), 4));
+    }
+}

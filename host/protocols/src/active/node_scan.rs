@@ -1,0 +1,181 @@
+//! Which CANopen nodes are there: each is asked for its device type (1000), and heartbeats are heard meanwhile.
+
+use std::collections::VecDeque;
+
+use cantap_trace::Id;
+use cantap_wire::Frame;
+
+use super::Machine;
+use super::sdo::SdoIds;
+
+/// Questions that wait in the sender's queue at the same time.
+const MOST_UNDER_WAY: usize = 8;
+/// Object 1000, device type.
+const DEVICE_TYPE: [u8; 3] = [0x00, 0x10, 0];
+
+/// A node that was found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct FoundNode {
+    /// Its number, 1 to 127.
+    pub node: u8,
+    /// Whether it has answered by SDO, if only to refuse.
+    pub answers: bool,
+    /// Its device type, if it told it.
+    pub device_type: Option<u32>,
+    /// Its state as its heartbeat or boot-up message has it.
+    pub state: Option<u8>,
+}
+
+/// Asks nodes, and listens.
+#[derive(Debug)]
+pub struct NodeScan {
+    to_ask: VecDeque<u8>,
+    /// Frames for nodes that began something longer.
+    aborts: VecDeque<Frame>,
+    found: [FoundNode; 128],
+    asked: [bool; 128],
+    under_way: usize,
+    wait_ns: u64,
+    until_ns: Option<u64>,
+    started: bool,
+}
+
+impl NodeScan {
+    /// Asks the nodes of a range, each 1 to 127, none if it is empty; hears heartbeats of all. Ends so long after the last question.
+    pub fn new(nodes: impl IntoIterator<Item = u8>, wait_ns: u64) -> Self {
+        Self {
+            to_ask: nodes.into_iter().filter(|node| (1..=127).contains(node)).collect(),
+            aborts: VecDeque::new(),
+            found: [FoundNode::default(); 128],
+            asked: [false; 128],
+            under_way: 0,
+            wait_ns,
+            until_ns: None,
+            started: false,
+        }
+    }
+
+    /// Those that were found, by their numbers.
+    pub fn found(&self) -> impl Iterator<Item = FoundNode> + '_ {
+        let there = |node: &&FoundNode| node.answers || node.state.is_some();
+        self.found.iter().filter(there).copied()
+    }
+}
+
+impl Machine for NodeScan {
+    fn next(&mut self, now_ns: u64) -> Option<Frame> {
+        if !self.started {
+            self.started = true;
+            self.until_ns = Some(now_ns + self.wait_ns);
+        }
+        if self.under_way >= MOST_UNDER_WAY {
+            return None;
+        }
+        let frame = self.aborts.pop_front().or_else(|| {
+            let node = self.to_ask.pop_front()?;
+            self.asked[usize::from(node)] = true;
+            let [low, high, sub] = DEVICE_TYPE;
+            Some(Frame::from_bus(SdoIds::of(node).request, false, 8, [0x40, low, high, sub, 0, 0, 0, 0]))
+        });
+        if frame.is_some() {
+            self.under_way += 1;
+        } else if self.under_way == 0 && self.until_ns.is_some_and(|until_ns| now_ns >= until_ns) {
+            self.until_ns = None;
+        }
+        frame
+    }
+
+    fn sent(&mut self, now_ns: u64) {
+        self.under_way = self.under_way.saturating_sub(1);
+        self.until_ns = Some(now_ns + self.wait_ns);
+    }
+
+    fn hear(&mut self, _now_ns: u64, id: Id, data: &[u8]) {
+        if id.is_extended() {
+            return;
+        }
+        let node = (id.raw() & 0x7F) as u8;
+        let place = usize::from(node);
+        match (id.raw() & 0x780, data) {
+            (0x700, &[state]) if node > 0 => {
+                self.found[place].node = node;
+                self.found[place].state = Some(state & 0x7F);
+            }
+            (0x580, &[command, a, b, c, ref rest @ ..]) if self.asked[place] && [a, b, c] == DEVICE_TYPE => {
+                let found = &mut self.found[place];
+                (found.node, found.answers) = (node, true);
+                let [a, b, c, d] = rest.first_chunk().copied().unwrap_or_default();
+                match command {
+                    0x43 | 0x42 => found.device_type = Some(u32::from_le_bytes([a, b, c, d])),
+                    0x40 | 0x41 => {
+                        // It wants to send segments; nobody will ask for them.
+                        let [low, high, sub] = DEVICE_TYPE;
+                        let abort = [0x80, low, high, sub, 0, 0, 0, 8];
+                        self.aborts.push_back(Frame::from_bus(SdoIds::of(node).request, false, 8, abort));
+                    }
+                    _ => {}
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn gap(&mut self, _now_ns: u64) {}
+
+    fn due_ns(&self) -> Option<u64> {
+        self.until_ns.filter(|_| self.under_way == 0 && self.to_ask.is_empty())
+    }
+
+    fn is_done(&self) -> bool {
+        self.started && self.until_ns.is_none() && self.under_way == 0 && self.to_ask.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::active::testing::{Say, arrives, run};
+
+    #[test]
+    fn nodes_are_found_by_answers_and_by_heartbeats() {
+        let frame = |id: u32, bytes: &[u8]| Frame::data_frame(Id::standard_truncated(id), bytes).unwrap();
+        let mut aborted = false;
+        let mut peer = |id: Id, data: &[u8], say: &mut Say| match (id.raw(), data[0]) {
+            (0x605, _) => say.push((1000, frame(0x585, &[0x43, 0, 0x10, 0, 0x92, 1, 2, 0]))),
+            (0x607, _) => say.push((1000, frame(0x587, &[0x80, 0, 0x10, 0, 0, 0, 2, 6]))),
+            (0x608, 0x40) => say.push((1000, frame(0x588, &[0x41, 0, 0x10, 0, 9, 0, 0, 0]))),
+            (0x608, 0x80) => aborted = true,
+            (0x601, _) => {
+                say.push((0, frame(0x70A, &[0x85])));
+                // Somebody else's answer to somebody else's question.
+                say.push((0, frame(0x590, &[0x43, 0, 0x20, 0, 0, 0, 0, 0])));
+            }
+            _ => {}
+        };
+        let mut scan = NodeScan::new(1..=127, 100_000_000);
+        run(&mut scan, &mut peer, arrives);
+        let found: Vec<_> = scan.found().collect();
+        let node = |node, answers, device_type, state| FoundNode { node, answers, device_type, state };
+        assert_eq!(
+            found,
+            [
+                node(5, true, Some(0x0002_0192), None),
+                node(7, true, None, None),
+                node(8, true, None, None),
+                node(10, false, None, Some(5)),
+            ]
+        );
+        assert!(aborted);
+    }
+
+    #[test]
+    fn without_questions_it_only_listens() {
+        let mut scan = NodeScan::new([], 50);
+        assert_eq!(scan.next(1), None);
+        scan.hear(2, Id::standard_truncated(0x703), &[127]);
+        assert!(!scan.is_done());
+        assert_eq!(scan.due_ns(), Some(51));
+        assert_eq!(scan.next(51), None);
+        assert!(scan.is_done() && scan.found().count() == 1);
+    }
+}

@@ -1,0 +1,523 @@
+//! A J1939 node that claims an address, asks for parameter groups, and sends messages of any length (J1939-21 and J1939-81).
+//!
+//! The address is defended as long as the station works. A message of many frames is taken and sent by RTS/CTS, and to all by BAM.
+
+mod long_message;
+
+use std::collections::VecDeque;
+
+use cantap_trace::Id;
+use cantap_wire::Frame;
+
+use self::long_message::{Incoming, Outgoing};
+use super::{Machine, earlier};
+use crate::j1939::Header;
+
+const MS: u64 = 1_000_000;
+/// Nobody may object to a claim any more after this time (J1939-81).
+const CLAIM_NS: u64 = 250 * MS;
+/// So long an answer is waited for: Tr is 200 ms, and T3 1250 ms.
+const ANSWER_NS: u64 = 1250 * MS;
+/// A message to all that has begun in time takes no longer: 255 frames, 50 ms each.
+const LONGEST_NS: u64 = 15_000 * MS;
+const GLOBAL: u8 = 255;
+const NULL: u8 = 254;
+const REQUEST: u32 = 0xEA00;
+const ACKNOWLEDGE: u32 = 0xE800;
+const CLAIM: u32 = 0xEE00;
+const CONTROL: u32 = 0xEC00;
+const DATA: u32 = 0xEB00;
+/// The longest message (J1939-21).
+const MOST_BYTES: usize = 1785;
+/// Addresses that anybody may take (J1939-81).
+const FREE: std::ops::RangeInclusive<u8> = 128..=247;
+/// The NAME's bit that says so.
+const TAKES_ANY: u64 = 1 << 63;
+
+/// What a station is to do with its address.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum StationJob {
+    /// Nothing but claim it.
+    Claim,
+    /// Ask for a parameter group.
+    Request {
+        /// The group, 18 bits.
+        pgn: u32,
+        /// Who is asked; 255 for all.
+        to: u8,
+    },
+    /// Send a message of up to 1785 bytes.
+    Send {
+        /// The group, 18 bits.
+        pgn: u32,
+        /// To whom; 255 for all.
+        to: u8,
+        /// 0, the highest, to 7.
+        priority: u8,
+        /// Its bytes.
+        data: Vec<u8>,
+    },
+}
+
+/// A message to this station, or to all, that answers its request.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct GroupAnswer {
+    /// The sender's address.
+    pub from: u8,
+    /// Its bytes.
+    pub data: Vec<u8>,
+}
+
+/// Why a station failed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum StationError {
+    /// Another node has the address, and a NAME that goes first.
+    #[error(
+        "the address {address} is taken by the node with the NAME {name:016X}, and there is none left to take"
+    )]
+    AddressTaken {
+        /// The address that was tried last.
+        address: u8,
+        /// The NAME of who has it.
+        name: u64,
+    },
+    /// Nobody answered the request.
+    #[error("no answer within {after_ms} ms")]
+    NoAnswer {
+        /// How long was waited.
+        after_ms: u64,
+    },
+    /// The request was answered that there will be none.
+    #[error("node {from} answers: {}", acknowledgement(*control))]
+    NotAcknowledged {
+        /// Who.
+        from: u8,
+        /// Why, from 1.
+        control: u8,
+    },
+    /// The other side ended a message of many frames.
+    #[error("node {from} aborted the message: {}", abort_reason(*reason))]
+    Aborted {
+        /// Who.
+        from: u8,
+        /// Why.
+        reason: u8,
+    },
+    /// The other side of a message of many frames went silent.
+    #[error("nothing came from node {from} for {after_ms} ms, after {done} of {total} frames of the message")]
+    Silent {
+        /// Who.
+        from: u8,
+        /// How long was waited.
+        after_ms: u64,
+        /// Frames so far.
+        done: u8,
+        /// Frames of the message.
+        total: u8,
+    },
+    /// The other side of a message of many frames asks for what there is not, or again and again for the same.
+    #[error("node {from} does not get on with the message: it has asked for frames again {times} times")]
+    Endless {
+        /// Who.
+        from: u8,
+        /// How often.
+        times: u32,
+    },
+}
+
+const fn acknowledgement(control: u8) -> &'static str {
+    match control {
+        1 => "negative: it does not have the group",
+        2 => "access denied",
+        3 => "busy: it cannot answer now",
+        _ => "a reserved reason",
+    }
+}
+
+const fn abort_reason(reason: u8) -> &'static str {
+    match reason {
+        1 => "it has another connection already",
+        2 => "it lacks the resources",
+        3 => "it has timed out",
+        4 => "clear to send came while data was sent",
+        5 => "too many frames were asked for again",
+        6 => "an unexpected frame",
+        7 => "a frame with a wrong number",
+        8 => "a frame came twice",
+        9 => "the message is too long for it",
+        _ => "a reserved reason",
+    }
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Phase {
+    New,
+    /// The claim was sent; from its confirmation on, until then.
+    Claims {
+        until_ns: Option<u64>,
+    },
+    /// The address is ours; the job is yet to be begun.
+    Begins,
+    /// Waits for answers.
+    Waits {
+        until_ns: Option<u64>,
+    },
+    /// Sends a message of one frame, or gives up an address.
+    Closing,
+    /// Sends a message of many frames.
+    Sends,
+    Done,
+}
+
+/// One node.
+#[derive(Debug)]
+pub struct Station {
+    name: u64,
+    address: u8,
+    job: StationJob,
+    phase: Phase,
+    /// Frames to be sent, in front of what a long message wants.
+    out: VecDeque<Frame>,
+    under_way: VecDeque<bool>,
+    taken: [bool; 256],
+    incoming: Vec<Incoming>,
+    outgoing: Option<Outgoing>,
+    answers: Vec<GroupAnswer>,
+    end: Option<Result<(), StationError>>,
+}
+
+/// A message's frame.
+fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &[u8]) -> Frame {
+    let mut bytes = [0xFF; 8];
+    let length = data.len().min(8);
+    bytes[..length].copy_from_slice(&data[..length]);
+    Frame::from_bus(Header { priority, pgn, source, destination }.id(), false, length as u8, bytes)
+}
+
+/// A group's number as requests have it.
+fn three(pgn: u32) -> [u8; 3] {
+    let [low, middle, high, _] = pgn.to_le_bytes();
+    [low, middle, high]
+}
+
+impl Station {
+    /// A node of this NAME that would like this address, 0 to 253.
+    pub const fn new(name: u64, address: u8, job: StationJob) -> Self {
+        Self {
+            name,
+            address,
+            job,
+            phase: Phase::New,
+            out: VecDeque::new(),
+            under_way: VecDeque::new(),
+            taken: [false; 256],
+            incoming: Vec::new(),
+            outgoing: None,
+            answers: Vec::new(),
+            end: None,
+        }
+    }
+
+    /// A node that has claimed its address already.
+    pub fn with_address(name: u64, address: u8, job: StationJob) -> Self {
+        Self { phase: Phase::Begins, ..Self::new(name, address, job) }
+    }
+
+    /// The address that it has, or tries to get.
+    pub const fn address(&self) -> u8 {
+        self.address
+    }
+
+    /// What was answered. To be called when it is done.
+    pub fn finish(self) -> Result<Vec<GroupAnswer>, StationError> {
+        self.end.unwrap_or(Ok(())).map(|()| self.answers)
+    }
+
+    fn fail(&mut self, error: StationError) {
+        self.end.get_or_insert(Err(error));
+        self.phase = Phase::Done;
+    }
+
+    fn done(&mut self) {
+        self.end.get_or_insert(Ok(()));
+        self.phase = Phase::Done;
+    }
+
+    fn claim(&mut self) {
+        self.out.push_back(frame(6, CLAIM, self.address, GLOBAL, &self.name.to_le_bytes()));
+    }
+
+    /// Another node claims an address.
+    fn claimed(&mut self, by: u8, name: u64) {
+        self.taken[usize::from(by)] = true;
+        if by != self.address || matches!(self.phase, Phase::New | Phase::Done | Phase::Closing) {
+            return;
+        }
+        // The lower NAME goes first (J1939-81).
+        if self.name < name {
+            return self.claim();
+        }
+        let next = if self.name & TAKES_ANY == 0 {
+            None
+        } else {
+            FREE.into_iter().find(|free| !self.taken[usize::from(*free)])
+        };
+        self.out.clear();
+        if let Some(next) = next {
+            // What was begun with the old address has nobody to come back to.
+            self.incoming.clear();
+            self.address = next;
+            self.claim();
+            self.phase = Phase::Claims { until_ns: None };
+        } else {
+            self.end = Some(Err(StationError::AddressTaken { address: self.address, name }));
+            self.address = NULL;
+            self.claim();
+            self.phase = Phase::Closing;
+        }
+    }
+
+    fn begin(&mut self) {
+        match self.job.clone() {
+            StationJob::Claim => self.done(),
+            StationJob::Request { pgn, to } => {
+                self.out.push_back(frame(6, REQUEST, self.address, to, &three(pgn)));
+                self.phase = Phase::Waits { until_ns: None };
+            }
+            StationJob::Send { pgn, to, priority, data } if data.len() <= 8 => {
+                self.out.push_back(frame(priority, pgn, self.address, to, &data));
+                self.phase = Phase::Closing;
+            }
+            StationJob::Send { pgn, to, data, .. } => {
+                self.outgoing = Some(Outgoing::new(self.address, to, pgn, data));
+                self.phase = Phase::Sends;
+            }
+        }
+    }
+
+    /// A whole message of somebody.
+    fn message(&mut self, header: Header, data: Vec<u8>) {
+        let Phase::Waits { .. } = self.phase else { return };
+        let StationJob::Request { pgn, to } = self.job else { return };
+        if to != GLOBAL && header.source != to {
+            return;
+        }
+        if header.pgn == ACKNOWLEDGE {
+            let is_ours = data.len() >= 8 && data[5..8] == three(pgn) && data[0] > 0;
+            // Acknowledgements go to all; the fifth byte says whom they are for, where it is used.
+            if is_ours && to != GLOBAL && (data[4] == self.address || data[4] == 0xFF) {
+                self.fail(StationError::NotAcknowledged { from: header.source, control: data[0] });
+            }
+            return;
+        }
+        if header.pgn != pgn {
+            return;
+        }
+        self.answers.push(GroupAnswer { from: header.source, data });
+        // Of all, whoever answers within the time; many say it again and again without being asked.
+        if to != GLOBAL {
+            self.done();
+        }
+    }
+
+    /// A frame of a connection that somebody else began, or of ours.
+    fn control(&mut self, now_ns: u64, header: Header, data: [u8; 8]) {
+        let pgn = u32::from_le_bytes([data[5], data[6], data[7], 0]);
+        let from = header.source;
+        if header.destination == self.address
+            && let Some(outgoing) = self.outgoing.as_mut().filter(|outgoing| outgoing.is_with(from, pgn))
+            && matches!(data[0], 17 | 19 | 255)
+        {
+            if let Err(error) = outgoing.control(now_ns, data) {
+                self.fail(error);
+            } else if self.outgoing.as_ref().is_some_and(Outgoing::is_done) {
+                self.done();
+            }
+            return;
+        }
+        let to_all = header.destination == GLOBAL;
+        match data[0] {
+            16 if header.destination == self.address => {
+                self.incoming.retain(|incoming| !incoming.is_of(from, false));
+                match Incoming::connection(now_ns, header, data) {
+                    Some(incoming) => self.incoming.push(incoming),
+                    None => self.out.push_back(long_message::abort(self.address, from, pgn, 9)),
+                }
+            }
+            32 if to_all && self.wants(pgn, from) => {
+                self.incoming.retain(|incoming| !incoming.is_of(from, true));
+                self.incoming.extend(Incoming::broadcast(now_ns, header, data));
+            }
+            255 if header.destination == self.address => {
+                self.incoming.retain(|incoming| !(incoming.is_of(from, false) && incoming.pgn() == pgn));
+                if self.wants(pgn, from) {
+                    self.fail(StationError::Aborted { from, reason: data[1] });
+                }
+            }
+            _ => {}
+        }
+    }
+
+    /// Whether a message answers what was asked.
+    fn wants(&self, pgn: u32, from: u8) -> bool {
+        matches!(self.phase, Phase::Waits { .. })
+            && matches!(self.job, StationJob::Request { pgn: asked, to } if asked == pgn && (to == GLOBAL || to == from))
+    }
+
+    fn data(&mut self, now_ns: u64, header: Header, data: [u8; 8]) {
+        let to_all = header.destination == GLOBAL;
+        if !to_all && header.destination != self.address {
+            return;
+        }
+        let Some(place) = self.incoming.iter().position(|incoming| incoming.is_of(header.source, to_all))
+        else {
+            return;
+        };
+        if self.incoming[place].take(now_ns, data) {
+            let incoming = self.incoming.remove(place);
+            self.out.extend(incoming.last_word(self.address));
+            let header = Header { pgn: incoming.pgn(), ..header };
+            self.message(header, incoming.into_data());
+        }
+    }
+
+    /// What time alone decides of messages that come in.
+    fn sweep(&mut self, now_ns: u64) {
+        let mut at = 0;
+        while at < self.incoming.len() {
+            match self.incoming[at].next(now_ns, self.address) {
+                Ok(frames) => {
+                    self.out.extend(frames);
+                    at += 1;
+                }
+                Err((error, last)) => {
+                    let incoming = self.incoming.remove(at);
+                    self.out.extend(last);
+                    if self.wants(incoming.pgn(), incoming.from())
+                        && !matches!(self.job, StationJob::Request { to: GLOBAL, .. })
+                    {
+                        self.fail(error);
+                    }
+                }
+            }
+        }
+    }
+}
+
+impl Machine for Station {
+    fn next(&mut self, now_ns: u64) -> Option<Frame> {
+        if !self.is_done() {
+            self.sweep(now_ns);
+        }
+        match self.phase {
+            Phase::New => {
+                self.claim();
+                self.phase = Phase::Claims { until_ns: None };
+            }
+            Phase::Claims { until_ns: Some(until_ns) } if now_ns >= until_ns => self.phase = Phase::Begins,
+            Phase::Waits { until_ns: Some(until_ns) }
+                if now_ns >= until_ns && (self.incoming.is_empty() || now_ns >= until_ns + LONGEST_NS) =>
+            {
+                if self.answers.is_empty() {
+                    self.fail(StationError::NoAnswer { after_ms: ANSWER_NS / MS });
+                } else {
+                    self.done();
+                }
+            }
+            _ => {}
+        }
+        if self.phase == Phase::Begins {
+            self.begin();
+        }
+        if let Some(frame) = self.out.pop_front() {
+            self.under_way.push_back(false);
+            return Some(frame);
+        }
+        if self.phase != Phase::Sends {
+            return None;
+        }
+        let next = self.outgoing.as_mut()?.next(now_ns);
+        match next {
+            Ok(Some(frame)) => {
+                self.under_way.push_back(true);
+                Some(frame)
+            }
+            Ok(None) => None,
+            Err((error, last)) => {
+                self.fail(error);
+                self.under_way.push_back(false);
+                Some(last)
+            }
+        }
+    }
+
+    fn sent(&mut self, now_ns: u64) {
+        if self.under_way.pop_front() == Some(true) {
+            if let Some(outgoing) = &mut self.outgoing {
+                outgoing.sent(now_ns);
+                if outgoing.is_done() {
+                    self.done();
+                }
+            }
+            return;
+        }
+        match &mut self.phase {
+            Phase::Claims { until_ns } if self.out.is_empty() => *until_ns = Some(now_ns + CLAIM_NS),
+            Phase::Waits { until_ns: until_ns @ None } => *until_ns = Some(now_ns + ANSWER_NS),
+            Phase::Closing if self.out.is_empty() => self.done(),
+            _ => {}
+        }
+    }
+
+    fn hear(&mut self, now_ns: u64, id: Id, data: &[u8]) {
+        let Some(header) = Header::of(id) else { return };
+        if self.is_done() {
+            return;
+        }
+        match (header.pgn, <[u8; 8]>::try_from(data)) {
+            (CLAIM, Ok(name)) => {
+                self.claimed(header.source, u64::from_le_bytes(name));
+                self.message(header, data.to_vec());
+            }
+            (REQUEST, _) if data.get(..3) == Some(&three(CLAIM)) => {
+                let asks_us = header.destination == GLOBAL || header.destination == self.address;
+                if asks_us && !matches!(self.phase, Phase::New | Phase::Closing) {
+                    self.claim();
+                }
+            }
+            (CONTROL, Ok(data)) => self.control(now_ns, header, data),
+            (DATA, Ok(data)) => self.data(now_ns, header, data),
+            (ACKNOWLEDGE, _) => self.message(header, data.to_vec()),
+            _ if header.destination == GLOBAL || header.destination == self.address => {
+                self.message(header, data.to_vec());
+            }
+            _ => {}
+        }
+    }
+
+    fn gap(&mut self, now_ns: u64) {
+        // Frames of a message are numbered from 1 to 255 without a turn, so a missing one shows; it is asked for again.
+        let _ = now_ns;
+    }
+
+    fn due_ns(&self) -> Option<u64> {
+        if !self.under_way.is_empty() {
+            return self.incoming.iter().map(Incoming::due_ns).min();
+        }
+        let own = match self.phase {
+            Phase::Claims { until_ns } => until_ns,
+            Phase::Waits { until_ns } if self.incoming.is_empty() => until_ns,
+            Phase::Sends => self.outgoing.as_ref().and_then(Outgoing::due_ns),
+            _ => None,
+        };
+        earlier(own, self.incoming.iter().map(Incoming::due_ns).min())
+    }
+
+    fn is_done(&self) -> bool {
+        self.phase == Phase::Done && self.out.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests;

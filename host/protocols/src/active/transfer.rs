@@ -1,0 +1,393 @@
+//! One message out or in by ISO 15765-2 on classical CAN, in normal, extended or mixed addressing.
+
+use cantap_wire::Frame;
+
+use crate::iso_tp::{Endpoint, FlowStatus, Pci};
+
+/// Frames of a block that wait in the sender's queue at the same time, where no distance is asked for.
+const MOST_UNDER_WAY: u32 = 16;
+/// The longest message that is taken, in bytes.
+const MOST_BYTES: u32 = 1 << 16;
+/// What a first frame can say in 12 bits.
+const MOST_SHORT: usize = 0xFFF;
+
+/// How transfers go.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct TransferSettings {
+    /// Fills frames up to eight bytes; without it they are as short as they can be.
+    pub padding: Option<u8>,
+    /// Frames that the other side may send until it waits for flow control; 0 for all.
+    pub block_size: u8,
+    /// The least distance of the other side's frames, as flow control has it: 0 to 7F in milliseconds, F1 to F9 in 100 µs.
+    pub separation: u8,
+    /// How long flow control is waited for (N_Bs).
+    pub flow_timeout_ns: u64,
+    /// How long the next frame is waited for (N_Cr).
+    pub next_timeout_ns: u64,
+    /// How often in a row the other side may ask to wait (N_WFTmax).
+    pub most_waits: u32,
+}
+
+impl Default for TransferSettings {
+    /// As ISO 15765-2 has it: a second each; everything at once; ten times to wait.
+    fn default() -> Self {
+        Self {
+            padding: Some(0xCC),
+            block_size: 0,
+            separation: 0,
+            flow_timeout_ns: 1_000_000_000,
+            next_timeout_ns: 1_000_000_000,
+            most_waits: 10,
+        }
+    }
+}
+
+/// Why a transfer ended before it was complete.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum TransferError {
+    /// Nobody said how to go on.
+    #[error("no flow control came within {after_ms} ms, after {sent} of {length} bytes")]
+    NoFlowControl {
+        /// How long was waited.
+        after_ms: u64,
+        /// Bytes sent so far.
+        sent: usize,
+        /// Bytes of the message.
+        length: usize,
+    },
+    /// The other side asked to wait again and again.
+    #[error("the receiver asked to wait {times} times in a row, after {sent} of {length} bytes")]
+    EndlessWait {
+        /// How often.
+        times: u32,
+        /// Bytes sent so far.
+        sent: usize,
+        /// Bytes of the message.
+        length: usize,
+    },
+    /// The receiver has no room for so long a message.
+    #[error("the receiver has no room for a message of {length} bytes (flow control: overflow)")]
+    Overflow {
+        /// Bytes of the message.
+        length: usize,
+    },
+    /// The other side's frames do not follow each other.
+    #[error("frame {got} came instead of {expected}, after {received} of {length} bytes")]
+    Sequence {
+        /// The number that was due.
+        expected: u8,
+        /// The one that came.
+        got: u8,
+        /// Bytes received so far.
+        received: usize,
+        /// Bytes of the message.
+        length: usize,
+    },
+    /// The other side went silent.
+    #[error("the next frame did not come within {after_ms} ms, after {received} of {length} bytes")]
+    NextMissing {
+        /// How long was waited.
+        after_ms: u64,
+        /// Bytes received so far.
+        received: usize,
+        /// Bytes of the message.
+        length: usize,
+    },
+    /// The other side announced more than is taken.
+    #[error("a message of {length} bytes is announced, and no more than {MOST_BYTES} are taken")]
+    TooLong {
+        /// Bytes announced.
+        length: u32,
+    },
+    /// The other side's frame is not as the standard has it.
+    #[error("the other side sent {0}")]
+    Malformed(&'static str),
+    /// Frames of the bus were lost on the way to this computer: the numbers alone cannot prove that none of the message is missing.
+    #[error("frames were lost on the way to this computer, so the message may not be whole")]
+    FramesLost,
+}
+
+/// A frame to an endpoint.
+fn frame(to: Endpoint, content: &[&[u8]], padding: Option<u8>) -> Frame {
+    let mut bytes = [padding.unwrap_or(0); 8];
+    let mut length = 0;
+    let all = to.address.as_slice().iter().chain(content.iter().flat_map(|part| part.iter()));
+    for (place, byte) in bytes.iter_mut().zip(all) {
+        *place = *byte;
+        length += 1;
+    }
+    Frame::from_bus(to.id, false, if padding.is_some() { 8 } else { length }, bytes)
+}
+
+/// Data bytes of a frame beside what is in front of them.
+fn room(to: Endpoint, control: usize) -> usize {
+    8 - control - usize::from(to.address.is_some())
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Sending {
+    /// Nothing was sent.
+    New,
+    /// The first frame, or a block, was handed over; from its confirmation on, there is a deadline.
+    AwaitsFlow { until_ns: Option<u64> },
+    /// A block is sent: frames that may still follow, and when.
+    Block { left: Option<u8>, gap_ns: u64, next_ns: u64 },
+    /// Everything was handed over.
+    Last,
+    /// Everything was on the bus.
+    Done,
+}
+
+/// Sends one message.
+#[derive(Clone, Debug)]
+pub struct TransferSender {
+    to: Endpoint,
+    data: Vec<u8>,
+    settings: TransferSettings,
+    at: usize,
+    number: u8,
+    state: Sending,
+    under_way: u32,
+    waits: u32,
+}
+
+impl TransferSender {
+    /// One message, of at least one byte, to an endpoint.
+    pub const fn new(to: Endpoint, data: Vec<u8>, settings: TransferSettings) -> Self {
+        Self { to, data, settings, at: 0, number: 1, state: Sending::New, under_way: 0, waits: 0 }
+    }
+
+    /// Whether it fits one frame.
+    pub fn is_single(&self) -> bool {
+        self.data.len() <= room(self.to, 1)
+    }
+
+    /// Whether everything was on the bus.
+    pub fn is_done(&self) -> bool {
+        self.state == Sending::Done
+    }
+
+    /// When to look again.
+    pub const fn due_ns(&self) -> Option<u64> {
+        match self.state {
+            Sending::AwaitsFlow { until_ns } => until_ns,
+            Sending::Block { next_ns, .. } if self.under_way == 0 => Some(next_ns),
+            _ => None,
+        }
+    }
+
+    /// The frame that is to be sent now; an error is the end.
+    pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, TransferError> {
+        let (length, padding) = (self.data.len(), self.settings.padding);
+        match self.state {
+            Sending::New if self.is_single() => {
+                self.state = Sending::Last;
+                self.at = length;
+                self.under_way = 1;
+                Ok(Some(frame(self.to, &[&[length as u8], &self.data], padding)))
+            }
+            Sending::New => {
+                let head = if length <= MOST_SHORT {
+                    vec![0x10 | (length >> 8) as u8, length as u8]
+                } else {
+                    [&[0x10, 0][..], &(length as u32).to_be_bytes()].concat()
+                };
+                self.at = room(self.to, head.len());
+                self.state = Sending::AwaitsFlow { until_ns: None };
+                self.under_way = 1;
+                Ok(Some(frame(self.to, &[&head, &self.data[..self.at]], padding)))
+            }
+            Sending::AwaitsFlow { until_ns: Some(until_ns) } if now_ns >= until_ns => {
+                let after_ms = self.settings.flow_timeout_ns / 1_000_000;
+                Err(TransferError::NoFlowControl { after_ms, sent: self.at, length })
+            }
+            Sending::Block { left, gap_ns, next_ns } => {
+                let may = if gap_ns == 0 {
+                    self.under_way < MOST_UNDER_WAY
+                } else {
+                    self.under_way == 0 && now_ns >= next_ns
+                };
+                if !may {
+                    return Ok(None);
+                }
+                let end = length.min(self.at + room(self.to, 1));
+                let sent = frame(self.to, &[&[0x20 | self.number], &self.data[self.at..end]], padding);
+                (self.at, self.number) = (end, (self.number + 1) & 15);
+                self.under_way += 1;
+                let left = left.map(|left| left - 1);
+                self.state = match left {
+                    _ if end == length => Sending::Last,
+                    Some(0) => Sending::AwaitsFlow { until_ns: None },
+                    left => Sending::Block { left, gap_ns, next_ns },
+                };
+                Ok(Some(sent))
+            }
+            _ => Ok(None),
+        }
+    }
+
+    /// A frame of its was on the bus.
+    pub const fn sent(&mut self, now_ns: u64) {
+        self.under_way = self.under_way.saturating_sub(1);
+        match &mut self.state {
+            Sending::AwaitsFlow { until_ns } if self.under_way == 0 => {
+                *until_ns = Some(now_ns + self.settings.flow_timeout_ns);
+            }
+            Sending::Block { gap_ns, next_ns, .. } => *next_ns = now_ns + *gap_ns,
+            Sending::Last if self.under_way == 0 => self.state = Sending::Done,
+            _ => {}
+        }
+    }
+
+    /// Flow control came; an error is the end. What was not waited for is ignored, as ISO 15765-2 has it.
+    pub fn flow(
+        &mut self,
+        now_ns: u64,
+        status: FlowStatus,
+        block_size: u8,
+        separation_us: u32,
+    ) -> Result<(), TransferError> {
+        let Sending::AwaitsFlow { until_ns } = &mut self.state else { return Ok(()) };
+        let (sent, length) = (self.at, self.data.len());
+        match status {
+            FlowStatus::Go => {
+                self.waits = 0;
+                let gap_ns = u64::from(separation_us) * 1000;
+                self.state =
+                    Sending::Block { left: (block_size > 0).then_some(block_size), gap_ns, next_ns: now_ns };
+                Ok(())
+            }
+            FlowStatus::Wait => {
+                self.waits += 1;
+                if self.waits > self.settings.most_waits {
+                    return Err(TransferError::EndlessWait { times: self.waits, sent, length });
+                }
+                *until_ns = Some(now_ns + self.settings.flow_timeout_ns);
+                Ok(())
+            }
+            FlowStatus::Overflow => Err(TransferError::Overflow { length }),
+        }
+    }
+}
+
+/// A message that comes in.
+#[derive(Clone, Debug)]
+struct Receiving {
+    data: Vec<u8>,
+    length: usize,
+    number: u8,
+    /// Frames until the next flow control is due.
+    left: Option<u8>,
+    until_ns: u64,
+}
+
+/// Receives messages of one sender, one after the other.
+#[derive(Clone, Debug)]
+pub struct TransferReceiver {
+    flow_to: Endpoint,
+    settings: TransferSettings,
+    receiving: Option<Receiving>,
+    /// The flow control frame that is to be sent.
+    flow: Option<Frame>,
+    /// The device itself sends flow control after the next frame.
+    flow_by_device: bool,
+}
+
+impl TransferReceiver {
+    /// Receives from whoever takes flow control at an endpoint. With `flow_by_device`, the device sends the first flow control frame by
+    /// itself, as its reply to the sender's next frame.
+    pub const fn new(flow_to: Endpoint, settings: TransferSettings, flow_by_device: bool) -> Self {
+        Self { flow_to, settings, receiving: None, flow: None, flow_by_device }
+    }
+
+    /// The flow control frame that lets a sender go on.
+    pub fn go_on(flow_to: Endpoint, settings: &TransferSettings) -> Frame {
+        frame(flow_to, &[&[0x30, settings.block_size, settings.separation]], settings.padding)
+    }
+
+    /// Whether a message has begun and not ended.
+    pub const fn is_receiving(&self) -> bool {
+        self.receiving.is_some()
+    }
+
+    /// When to look again.
+    pub fn due_ns(&self) -> Option<u64> {
+        self.receiving.as_ref().map(|receiving| receiving.until_ns)
+    }
+
+    /// The flow control frame that is to be sent now; an error is the end of the message.
+    pub fn next(&mut self, now_ns: u64) -> Result<Option<Frame>, TransferError> {
+        if let Some(flow) = self.flow.take() {
+            return Ok(Some(flow));
+        }
+        match self.receiving.take_if(|receiving| now_ns >= receiving.until_ns) {
+            None => Ok(None),
+            Some(receiving) => Err(TransferError::NextMissing {
+                after_ms: self.settings.next_timeout_ns / 1_000_000,
+                received: receiving.data.len(),
+                length: receiving.length,
+            }),
+        }
+    }
+
+    /// Frames may be missing.
+    pub fn gap(&mut self) -> Result<(), TransferError> {
+        if self.receiving.take().is_some() { Err(TransferError::FramesLost) } else { Ok(()) }
+    }
+
+    /// Takes a frame of the sender; returns the message that is whole with it.
+    pub fn take(&mut self, now_ns: u64, pci: Pci<'_>) -> Result<Option<Vec<u8>>, TransferError> {
+        let by_device = std::mem::take(&mut self.flow_by_device);
+        let until_ns = now_ns + self.settings.next_timeout_ns;
+        match pci {
+            Pci::Single(data) => {
+                self.receiving = None;
+                Ok(Some(data.to_vec()))
+            }
+            Pci::First { length, .. } if length > MOST_BYTES => {
+                self.receiving = None;
+                self.flow = Some(frame(self.flow_to, &[&[0x32, 0, 0]], self.settings.padding));
+                Err(TransferError::TooLong { length })
+            }
+            Pci::First { length, data } => {
+                self.flow = (!by_device).then(|| Self::go_on(self.flow_to, &self.settings));
+                self.receiving = Some(Receiving {
+                    data: data.to_vec(),
+                    length: length as usize,
+                    number: 1,
+                    left: self.block(),
+                    until_ns,
+                });
+                Ok(None)
+            }
+            Pci::Consecutive { number, data } => {
+                let Some(mut receiving) = self.receiving.take() else { return Ok(None) };
+                let (received, length) = (receiving.data.len(), receiving.length);
+                if number != receiving.number {
+                    let expected = receiving.number;
+                    return Err(TransferError::Sequence { expected, got: number, received, length });
+                }
+                receiving.data.extend_from_slice(data);
+                if receiving.data.len() >= length {
+                    receiving.data.truncate(length);
+                    return Ok(Some(receiving.data));
+                }
+                receiving.number = (number + 1) & 15;
+                receiving.until_ns = until_ns;
+                receiving.left = receiving.left.map(|left| left - 1);
+                if receiving.left == Some(0) {
+                    receiving.left = self.block();
+                    self.flow = Some(Self::go_on(self.flow_to, &self.settings));
+                }
+                self.receiving = Some(receiving);
+                Ok(None)
+            }
+            Pci::Flow { .. } => Ok(None),
+        }
+    }
+
+    fn block(&self) -> Option<u8> {
+        Some(self.settings.block_size).filter(|size| *size > 0)
+    }
+}

@@ -1,0 +1,446 @@
+//! What a bus is made of, by what was said on it: its nodes with their states and trouble codes, the objects that were read, written
+//! or sent, and how long responses take.
+//!
+//! Memory: so many nodes, services and objects as the constants here say; what comes beyond is counted.
+
+use std::collections::BTreeMap;
+
+use hdrhistogram::Histogram as Counts;
+
+use crate::{Event, Party, Protocol, Trouble, Value};
+
+const MOST_NODES: usize = 1024;
+const MOST_SERVICES: usize = 256;
+const MOST_OBJECTS: usize = 8192;
+/// Lists of trouble codes of a node: confirmed, pending, previously active.
+const MOST_LISTS: usize = 8;
+/// Characters that are kept of a value.
+const MOST_TEXT: usize = 256;
+
+/// Counts what events say.
+#[derive(Clone, Debug, Default)]
+pub struct Overview {
+    services: BTreeMap<(u8, Protocol, String), ServiceFigures>,
+    nodes: BTreeMap<(u8, Protocol, String), KnownNode>,
+    objects: BTreeMap<(u8, Protocol, String, String), KnownObject>,
+    left_out: u64,
+}
+
+/// How often a service was used, and how long its responses took.
+#[derive(Clone, Debug, Default)]
+pub struct ServiceFigures {
+    /// Requests and their responses, or messages of a kind.
+    pub count: u64,
+    /// Those in which something went wrong.
+    pub faults: u64,
+    /// Requests that nobody answered.
+    pub unanswered: u64,
+    /// From the end of the request to the first frame of its response.
+    pub responses: Histogram,
+}
+
+/// Times in nanoseconds: least and most as they were, what lies between within 0.1 %.
+#[derive(Clone, Debug, Default)]
+pub struct Histogram {
+    counts: Option<Box<Counts<u32>>>,
+    least_ns: i64,
+    most_ns: i64,
+}
+
+/// A node, server or device.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct KnownNode {
+    /// When it was first and last heard, in nanoseconds.
+    pub first_ns: i64,
+    /// See [`Self::first_ns`].
+    pub last_ns: i64,
+    /// What it had to do with.
+    pub events: u64,
+    /// Those in which something went wrong.
+    pub faults: u64,
+    /// Its state: CANopen's, or that it is missing.
+    pub state: Option<String>,
+    /// The time between two heartbeats in milliseconds, once one was missed.
+    pub period_ms: Option<f64>,
+    /// How often a heartbeat or the answer to a guard was missed.
+    pub missed: u64,
+    /// Who it is: a VIN, the function and manufacturer of a NAME.
+    pub identity: Option<String>,
+    /// Its trouble codes, by the list that they were in.
+    pub codes: BTreeMap<String, String>,
+}
+
+/// Something of a node that was read, written or sent.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct KnownObject {
+    /// Its name, where it is known.
+    pub name: Option<String>,
+    /// How often.
+    pub count: u64,
+    /// Its last value as text, where it is one that need not change.
+    pub value: Option<String>,
+    /// It has had several values.
+    pub varies: bool,
+}
+
+impl Histogram {
+    fn add(&mut self, ns: i64) {
+        if self.counts.is_none() {
+            // A tenth of a microsecond is finer than any stamp is good; three digits are what memory is worth.
+            self.counts = Counts::new(3).ok().map(Box::new);
+            (self.least_ns, self.most_ns) = (ns, ns);
+        }
+        (self.least_ns, self.most_ns) = (self.least_ns.min(ns), self.most_ns.max(ns));
+        if let Some(counts) = &mut self.counts {
+            // It grows as it needs to: only what no memory could hold would not be counted.
+            let _ = counts.record((ns.max(0) / UNIT_NS).unsigned_abs());
+        }
+    }
+
+    /// How many times there are.
+    pub fn count(&self) -> u64 {
+        self.counts.as_ref().map_or(0, |counts| counts.len())
+    }
+
+    /// The time, in milliseconds, that so many percent of them do not exceed: 0 for the least, 100 for the most.
+    pub fn percentile_ms(&self, percent: f64) -> Option<f64> {
+        let counts = self.counts.as_ref()?;
+        let ns = if percent <= 0.0 {
+            self.least_ns
+        } else if percent >= 100.0 {
+            self.most_ns
+        } else {
+            let middle = counts.value_at_quantile(percent / 100.0);
+            (i64::try_from(middle).unwrap_or(i64::MAX).saturating_mul(UNIT_NS))
+                .clamp(self.least_ns, self.most_ns)
+        };
+        Some(ns as f64 / 1e6)
+    }
+}
+
+const UNIT_NS: i64 = 100;
+
+impl Overview {
+    /// Takes an event.
+    pub fn take(&mut self, event: &Event) {
+        self.service(event);
+        let Some(of) = subject(event) else { return };
+        let of = of.to_string();
+        self.node(event, &of);
+        self.object(event, of);
+    }
+
+    /// By channel, protocol and name of the service.
+    pub fn services(&self) -> impl Iterator<Item = ((u8, Protocol, &str), &ServiceFigures)> {
+        self.services
+            .iter()
+            .map(|((channel, protocol, title), figures)| ((*channel, *protocol, &**title), figures))
+    }
+
+    /// By channel, protocol and number or identifier.
+    pub fn nodes(&self) -> impl Iterator<Item = ((u8, Protocol, &str), &KnownNode)> {
+        self.nodes.iter().map(|((channel, protocol, node), known)| ((*channel, *protocol, &**node), known))
+    }
+
+    /// By channel, protocol, node and number of the object.
+    pub fn objects(&self) -> impl Iterator<Item = ((u8, Protocol, &str, &str), &KnownObject)> {
+        self.objects.iter().map(|((channel, protocol, node, object), known)| {
+            ((*channel, *protocol, &**node, &**object), known)
+        })
+    }
+
+    /// What was not counted because there are too many.
+    pub const fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    fn service(&mut self, event: &Event) {
+        // Only where somebody answers: what is sent by itself has its period in the statistics of its identifier.
+        if event.response_ns.is_none() && event.kind != "no_response" {
+            return;
+        }
+        let key = (event.channel, event.protocol, service_name(event));
+        let Some(figures) = entry(&mut self.services, key, MOST_SERVICES) else {
+            self.left_out += 1;
+            return;
+        };
+        figures.count += 1;
+        figures.faults += u64::from(event.is_fault());
+        figures.unanswered += u64::from(event.kind == "no_response");
+        if let Some(ns) = event.response_ns {
+            figures.responses.add(ns);
+        }
+    }
+
+    fn node(&mut self, event: &Event, of: &str) {
+        let key = (event.channel, event.protocol, of.to_owned());
+        let is_new = !self.nodes.contains_key(&key);
+        let Some(node) = entry(&mut self.nodes, key, MOST_NODES) else {
+            self.left_out += 1;
+            return;
+        };
+        if is_new {
+            node.first_ns = event.start_ns;
+        }
+        node.last_ns = node.last_ns.max(event.time_ns);
+        node.events += 1;
+        node.faults += u64::from(event.is_fault());
+        match event.kind {
+            "state" | "boot_up" => node.state = Some(event.title.to_string()),
+            "heartbeat_back" => {
+                let state = event.title.rsplit(": ").next().unwrap_or_default();
+                node.state = Some(state.to_owned());
+            }
+            "heartbeat_missing" | "guard_missing" => {
+                node.missed += 1;
+                node.state = Some(event.title.to_string());
+                node.period_ms = number(event, "period_ms").or(node.period_ms);
+            }
+            "emergency" => {
+                let code = event.field("code").map(ToString::to_string).unwrap_or_default();
+                keep(&mut node.codes, "emergency", code);
+            }
+            "address_claim" => node.identity = Some(identity(event)),
+            _ => {}
+        }
+        if let Some(codes) = event.field("codes").and_then(text) {
+            keep(&mut node.codes, &event.title, codes);
+        } else if number(event, "trouble_codes") == Some(0.0) {
+            keep(&mut node.codes, &event.title, "none".to_owned());
+        }
+        let vin = event.field("vin").or_else(|| {
+            let is_vin = number(event, "did") == Some(f64::from(0xF190));
+            event.field("value").filter(|_| is_vin && event.protocol == Protocol::Uds)
+        });
+        if let Some(vin) = vin.and_then(text) {
+            node.identity = Some(vin);
+        }
+    }
+
+    fn object(&mut self, event: &Event, of: String) {
+        let Some((object, name, value)) = object(event) else { return };
+        let key = (event.channel, event.protocol, of, object);
+        let Some(known) = entry(&mut self.objects, key, MOST_OBJECTS) else {
+            self.left_out += 1;
+            return;
+        };
+        known.count += 1;
+        known.name = known.name.take().or(name);
+        if let Some(value) = value {
+            known.varies |= known.value.as_ref().is_some_and(|before| *before != value);
+            known.value = Some(value);
+        }
+    }
+}
+
+/// The entry, which is made where there is room.
+fn entry<K: Ord, V: Default>(map: &mut BTreeMap<K, V>, key: K, most: usize) -> Option<&mut V> {
+    if map.len() >= most && !map.contains_key(&key) {
+        return None;
+    }
+    Some(map.entry(key).or_default())
+}
+
+fn keep(lists: &mut BTreeMap<String, String>, list: &str, codes: String) {
+    if lists.len() < MOST_LISTS || lists.contains_key(list) {
+        lists.insert(list.to_owned(), short(codes));
+    }
+}
+
+fn short(text: String) -> String {
+    if text.chars().count() <= MOST_TEXT {
+        text
+    } else {
+        text.chars().take(MOST_TEXT).chain(['…']).collect()
+    }
+}
+
+fn number(event: &Event, name: &str) -> Option<f64> {
+    event.field(name)?.value.as_number()
+}
+
+fn text(field: &crate::Field) -> Option<String> {
+    match &field.value {
+        Value::Text(text) => Some(text.to_string()),
+        _ => None,
+    }
+}
+
+/// Services as people count them: SDO's by what they do, not by object.
+fn service_name(event: &Event) -> String {
+    match event.kind {
+        "sdo_read" => "SDO read".to_owned(),
+        "sdo_write" => "SDO write".to_owned(),
+        "state" | "guard" => "guarding".to_owned(),
+        _ => event.title.to_string(),
+    }
+}
+
+/// Whom the event is about: the server that was asked, or the sender.
+fn subject(event: &Event) -> Option<Party> {
+    let known = |party: Party| (!matches!(party, Party::Unknown | Party::Everyone)).then_some(party);
+    match event.protocol {
+        // A request that nobody answers says nothing about a node, and one to all nothing about any.
+        Protocol::J1939 | Protocol::Nmea2000 if event.kind == "no_response" => known(event.to),
+        Protocol::J1939 | Protocol::Nmea2000 => known(event.from),
+        Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd => match event.kind {
+            "response" => known(event.from),
+            "exchange" | "refusal" => known(event.to),
+            "no_response" if matches!(event.trouble, Some(Trouble::Timeout { .. })) => known(event.to),
+            _ => None,
+        },
+        Protocol::DeviceNet if matches!(event.kind, "exchange" | "refusal" | "no_response") => {
+            known(event.to)
+        }
+        Protocol::IsoTp => known(event.from),
+        _ => event.node().map(Party::Node),
+    }
+}
+
+/// Who a NAME says that a node is.
+fn identity(event: &Event) -> String {
+    let part = |name: &str| {
+        let field = event.field(name)?;
+        Some(field.text.as_ref().map_or_else(|| format!("{name} {}", field.value), ToString::to_string))
+    };
+    let parts = ["function", "manufacturer", "identity"].into_iter().filter_map(part);
+    parts.collect::<Vec<_>>().join(", ")
+}
+
+/// The object that an event is about: its number, its name, and its value where it is one that need not change.
+fn object(event: &Event) -> Option<(String, Option<String>, Option<String>)> {
+    let field = |name: &str| event.field(name);
+    let meaning = |name: &str| field(name).and_then(|field| field.text.as_ref()).map(ToString::to_string);
+    let value = || {
+        let value = field("value").map(|field| short(field.value.to_string()));
+        value.filter(|_| event.trouble.is_none())
+    };
+    Some(match event.protocol {
+        Protocol::Uds => match (field("did"), field("routine")) {
+            (Some(did), _) => {
+                let one = event.fields.iter().filter(|field| field.name == "did").count() == 1;
+                (format!("did {}", did.value), meaning("did"), value().filter(|_| one))
+            }
+            (_, Some(routine)) => (format!("routine {}", routine.value), meaning("routine"), None),
+            _ => return None,
+        },
+        Protocol::Kwp2000 => (format!("identifier {}", field("local_identifier")?.value), None, value()),
+        Protocol::Obd => {
+            (format!("pid {} of service {}", field("pid")?.value, field("sid")?.value), meaning("pid"), None)
+        }
+        Protocol::CanOpen => match event.kind {
+            "sdo_read" | "sdo_write" => {
+                let number = |name: &str| number(event, name);
+                let object = format!("{:04X}:{:02X}", number("index")? as u32, number("sub")? as u32);
+                (object, meaning("index"), value())
+            }
+            "pdo" => (event.title.to_string(), None, None),
+            _ => return None,
+        },
+        Protocol::J1939 | Protocol::Nmea2000 => match event.kind {
+            "request" | "no_response" | "acknowledgement" => return None,
+            _ => (format!("pgn {}", field("pgn")?.value), Some(event.title.to_string()), None),
+        },
+        Protocol::DeviceNet => match event.kind {
+            "io" => (event.title.to_string(), None, None),
+            _ => {
+                let class = format!("class {} instance {}", field("class")?.value, field("instance")?.value);
+                let attribute = field("attribute").map(|field| format!(" attribute {}", field.value));
+                (class + attribute.as_deref().unwrap_or_default(), meaning("class"), value())
+            }
+        },
+        Protocol::IsoTp => return None,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::at;
+    use crate::{Conversations, Options};
+
+    fn overview(protocol: Protocol, frames: &[(f64, &str)]) -> Overview {
+        let options = Options { protocols: vec![protocol], ..Options::default() };
+        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        for (ms, frame) in frames {
+            conversations.take(&at(*ms, frame), &mut events);
+        }
+        conversations.finish(&mut events);
+        let mut overview = Overview::default();
+        events.iter().for_each(|event| overview.take(event));
+        overview
+    }
+
+    #[test]
+    fn responses_are_measured_by_service() {
+        let mut frames = Vec::new();
+        for round in 0..100 {
+            frames.push((f64::from(round) * 100.0, "7E0#0322F18C"));
+            frames.push((f64::from(round) * 100.0 + f64::from(round) + 1.0, "7E8#0662F18C313233"));
+        }
+        frames.push((20_000.0, "7E0#0322F190"));
+        frames.push((20_001.0, "7E8#037F2231"));
+        frames.push((21_000.0, "7E0#023E00"));
+        frames.push((30_000.0, "123#"));
+        let overview = overview(Protocol::Uds, &frames);
+        let services: Vec<_> = overview.services().map(|((_, _, title), figures)| (title, figures)).collect();
+        let [(read, figures), (tester, silent)] = services[..] else { panic!("{services:?}") };
+        assert_eq!((read, figures.count, figures.faults), ("ReadDataByIdentifier", 101, 1));
+        let at = |percent| figures.responses.percentile_ms(percent).unwrap();
+        assert_eq!((at(0.0), at(100.0)), (1.0, 100.0));
+        assert!(
+            (at(50.0) - 50.0).abs() <= 1.0 && (at(99.0) - 99.0).abs() <= 1.0,
+            "{} {}",
+            at(50.0),
+            at(99.0)
+        );
+        assert_eq!((tester, silent.unanswered, silent.responses.count()), ("TesterPresent", 1, 0));
+        let objects: Vec<_> = overview.objects().collect();
+        assert_eq!(objects.len(), 2);
+        assert_eq!(objects[0].1.value.as_deref(), Some("\"123\""));
+    }
+
+    #[test]
+    fn nodes_have_their_states_codes_and_names() {
+        let plant = overview(
+            Protocol::CanOpen,
+            &[
+                (0.0, "705#00"),
+                (100.0, "705#7F"),
+                (200.0, "705#05"),
+                (300.0, "705#05"),
+                (310.0, "085#1023010000000000"),
+                (2000.0, "080#"),
+            ],
+        );
+        let (_, node) = plant.nodes().next().unwrap();
+        assert_eq!((node.state.as_deref(), node.missed), (Some("heartbeat missing"), 1));
+        assert!(node.codes["emergency"].contains("0x2310"), "{:?}", node.codes);
+        let truck = overview(
+            Protocol::J1939,
+            &[
+                (0.0, "18EEFF00#0100200000000010"),
+                (5.0, "18FECA00#0000A6010305FFFF"),
+                (9.0, "18FECA00#0000A6010305FFFF"),
+            ],
+        );
+        let (key, node) = truck.nodes().next().unwrap();
+        assert_eq!(key, (1, Protocol::J1939, "0"));
+        assert_eq!(node.identity.as_deref(), Some("engine, manufacturer 1, identity 1"));
+        assert!(node.codes["DM1 active trouble codes"].starts_with("SPN 422 FMI 3"), "{:?}", node.codes);
+        assert_eq!(truck.objects().count(), 2);
+    }
+
+    #[test]
+    fn memory_is_bounded_and_what_is_left_out_is_counted() {
+        let mut overview = Overview::default();
+        let mut event = Event::new(Protocol::CanOpen, &at(0.0, "605#"), "sdo_read", "SDO read");
+        event.to = Party::Node(5);
+        for index in 0..20_000_u32 {
+            event.fields = vec![crate::Field::hex("index", index, 4), crate::Field::hex("sub", 0_u8, 2)];
+            overview.take(&event);
+        }
+        assert_eq!(overview.objects().count(), MOST_OBJECTS);
+        assert_eq!(overview.left_out(), 20_000 - MOST_OBJECTS as u64);
+    }
+}

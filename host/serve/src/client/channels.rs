@@ -1,0 +1,206 @@
+//! A client's channels: opened, shared with others who have them open, and given up. Its filters, and what it stores.
+
+use std::time::Duration;
+
+use cantap_wire::message::{ChannelConfig, Filter, FrameKind, Role};
+use cantap_wire::{Channel, Command, Refusal, Reply};
+
+use super::Client;
+use crate::shared::only_listens;
+use crate::state::{State, Then, for_all};
+
+/// A channel that the board closes has said its last word by then.
+const STOP_TIMEOUT: Duration = Duration::from_secs(1);
+/// What a board has captured when it is asked for its time has arrived by then.
+const SETTLE_TIMEOUT: Duration = Duration::from_millis(30);
+
+/// How a channel comes to be a client's.
+enum Way {
+    /// It is open as the client wants it.
+    Attach(ChannelConfig),
+    /// It is closed.
+    Open,
+    /// It is open, and may be opened anew.
+    Reopen(ChannelConfig),
+}
+
+impl Client {
+    fn is_open(&self, channel: Channel) -> bool {
+        self.with(|_, member| member.views[channel.index()].config.is_some())
+    }
+
+    pub(super) fn open(&self, channel: Channel, config: Option<ChannelConfig>) -> Result<Reply, Refusal> {
+        if self.is_open(channel) {
+            return Err(Refusal::ChannelOpen);
+        }
+        let base = self.shared.state().base[channel.index()];
+        let wanted = match config.or(base) {
+            Some(config) => config,
+            None => match self.shared.ask(Command::Defaults { channel }, Then::Nothing)? {
+                Reply::Defaults(saved) => saved.config,
+                _ => return Err(Refusal::NothingSaved),
+            },
+        };
+        let way = self.way(channel, &wanted)?;
+        let then = || Then::Opened { client: Some((self.id, wanted)), channel };
+        let config = Some(for_all(wanted));
+        match way {
+            Way::Attach(current) => {
+                let given = ChannelConfig { timing: current.timing, ..wanted };
+                self.shared.state().attach(self.id, channel, given);
+                return Ok(Reply::Opened(given));
+            }
+            Way::Open => {
+                self.shared.ask(Command::Open { channel, config }, then())?;
+            }
+            Way::Reopen(before) => {
+                self.close_on_board(channel)?;
+                if let Err(refusal) = self.shared.ask(Command::Open { channel, config }, then()) {
+                    self.reopen(channel, before)?;
+                    return Err(refusal);
+                }
+            }
+        }
+        Ok(Reply::Opened(wanted))
+    }
+
+    /// How the channel can come to be as the client wants it, if it may.
+    fn way(&self, channel: Channel, wanted: &ChannelConfig) -> Result<Way, Refusal> {
+        let mut state = self.shared.state();
+        let (any_other, other_sends) = state.others_on(self.id, channel);
+        let (base, current) = (state.base[channel.index()], state.open[channel.index()]);
+        let is_base = base.is_some_and(|base| base.timing == wanted.timing);
+        if !only_listens(wanted) {
+            self.must_be(Role::Send)?;
+        }
+        let Some(current) = current else {
+            if !is_base || !only_listens(wanted) {
+                // Whoever may only listen takes the bit rate that there is.
+                let other = base.is_some() && only_listens(wanted) && self.role < Role::Configure;
+                state
+                    .hold(self.id)
+                    .map_err(|refusal| if other { Refusal::OtherSettings } else { refusal })?;
+            }
+            return Ok(Way::Open);
+        };
+        let is_same = current.timing == wanted.timing;
+        if is_same && (only_listens(wanted) || for_all(*wanted) == current) {
+            return Ok(Way::Attach(current));
+        }
+        // Others' stamps and loads are made with the timing that they know; senders count on their mode.
+        if (any_other && !is_same) || other_sends {
+            return Err(Refusal::OtherSettings);
+        }
+        state.hold(self.id)?;
+        Ok(Way::Reopen(current))
+    }
+
+    /// Closes a channel on the board and waits for all that it had to say.
+    fn close_on_board(&self, channel: Channel) -> Result<(), Refusal> {
+        let stopped = |state: &State| state.stopped[channel.index()];
+        let before = stopped(&self.shared.state());
+        self.shared.ask(Command::Close { channel }, Then::Nothing)?;
+        // If it never says so, the link has lost it.
+        self.shared.wait_for(STOP_TIMEOUT, |state| stopped(state) != before || state.hello.is_none());
+        self.shared.state().open[channel.index()] = None;
+        Ok(())
+    }
+
+    /// Opens a channel for those who have it open, who miss what was on the bus meanwhile.
+    fn reopen(&self, channel: Channel, config: ChannelConfig) -> Result<(), Refusal> {
+        let opened = self
+            .shared
+            .ask(Command::Open { channel, config: Some(config) }, Then::Opened { client: None, channel });
+        if opened.is_err() {
+            // They must not believe in a quiet bus.
+            self.shared.state().must_end = true;
+        }
+        opened.map(|_| ())
+    }
+
+    /// Gives a channel up. The board closes it if nobody else has it open, and only listens if nobody else sends.
+    pub(super) fn close(&self, channel: Channel) -> Result<(), Refusal> {
+        if !self.is_open(channel) {
+            return Ok(());
+        }
+        let sends = self.with(|_, member| member.views[channel.index()].transmits());
+        let (any_other, other_sends) = self.shared.state().others_on(self.id, channel);
+        if sends && any_other {
+            self.clear_entries(channel);
+            self.withdraw(channel, true)?;
+        }
+        let closed = if !any_other {
+            self.close_on_board(channel)
+        } else if sends && !other_sends {
+            let current = self.shared.state().open[channel.index()];
+            self.close_on_board(channel).and_then(|()| match current {
+                Some(current) => {
+                    self.shared.state().detach(self.id, channel);
+                    self.reopen(channel, for_all(ChannelConfig::listen_only(current.timing)))
+                }
+                None => Ok(()),
+            })
+        } else {
+            self.settle()
+        };
+        self.shared.state().detach(self.id, channel);
+        closed
+    }
+
+    /// Waits for what the board has captured until now.
+    fn settle(&self) -> Result<(), Refusal> {
+        if let Reply::Time(ticks) = self.shared.ask(Command::Time, Then::Nothing)? {
+            self.shared.wait_for(SETTLE_TIMEOUT, |state| state.latest_ticks >= ticks);
+        }
+        Ok(())
+    }
+
+    /// Filters are the server's: each client has its own, and the board hears for all.
+    pub(super) fn set_filters(&self, channel: Channel, filters: &[Filter]) -> Result<Reply, Refusal> {
+        if !filters.iter().all(Filter::is_valid) {
+            return Err(Refusal::BadId);
+        }
+        let mut state = self.shared.state();
+        let banks_total = state.hello.as_ref().map_or(0, |hello| hello.filter_banks);
+        let Some(member) = state.clients.get_mut(&self.id) else { return Err(Refusal::NoSession) };
+        let view = &mut member.views[channel.index()];
+        if view.config.is_some() {
+            return Err(Refusal::ChannelOpen);
+        }
+        view.filters = filters.to_vec();
+        Ok(Reply::Filters { banks_used: banks_of(filters).min(banks_total), banks_total })
+    }
+
+    /// Stores what the client has configured, its filters among it, which the board does not have otherwise.
+    pub(super) fn save_defaults(&self) -> Result<Reply, Refusal> {
+        let _setup = self.setup();
+        self.shared.state().hold(self.id)?;
+        let filters = self.with(|_, member| Some(member.views.clone())).ok_or(Refusal::NoSession)?;
+        for (channel, view) in Channel::ALL.into_iter().zip(&filters) {
+            let filters = heapless::Vec::from_slice(&view.filters).map_err(|_| Refusal::Malformed)?;
+            self.shared.ask(Command::SetFilters { channel, filters }, Then::Nothing)?;
+        }
+        let saved = self.shared.ask(Command::SaveDefaults, Then::Nothing);
+        for channel in Channel::ALL {
+            let filters = heapless::Vec::new();
+            self.shared.ask(Command::SetFilters { channel, filters }, Then::Nothing)?;
+        }
+        saved
+    }
+}
+
+/// Banks that filters would need on the board (docs/wire-protocol.md).
+fn banks_of(filters: &[Filter]) -> u8 {
+    let is_exact = |filter: &&Filter| {
+        let all = if filter.extended { cantap_wire::Id::MAX_EXTENDED } else { cantap_wire::Id::MAX_STANDARD };
+        filter.mask == all && filter.kind != FrameKind::Any
+    };
+    let count = |extended: bool, exact: bool| {
+        filters.iter().filter(|filter| filter.extended == extended && is_exact(filter) == exact).count()
+    };
+    let banks = count(true, false)
+        + count(true, true).div_ceil(2)
+        + count(false, false).div_ceil(2)
+        + count(false, true).div_ceil(4);
+    banks.clamp(1, usize::from(u8::MAX)) as u8
+}

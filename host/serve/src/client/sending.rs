@@ -1,0 +1,145 @@
+//! What a client sends: frames, periodic entries, replies. Each client has its own numbers for them, and takes them along when it leaves.
+
+use std::time::{Duration, Instant};
+
+use cantap_wire::message::{Periodic, Role, Trigger, TxFrame};
+use cantap_wire::{Channel, Command, Refusal, Reply};
+
+use super::Client;
+use crate::state::{Table, Then, clears};
+
+/// Frames that are given up have been reported by then.
+const WITHDRAW_TIMEOUT: Duration = Duration::from_millis(500);
+/// A client whose frames find the board's queue full, perhaps of another's, waits this long before it is refused.
+const ROOM_TIMEOUT: Duration = Duration::from_millis(800);
+
+impl Client {
+    /// Whether the client may send, and has the channel open for it.
+    pub(super) fn may_transmit_on(&self, channel: Channel) -> Result<(), Refusal> {
+        self.must_be(Role::Send)?;
+        self.with(|_, member| {
+            let view = &member.views[channel.index()];
+            Some(match view.config {
+                None => Err(Refusal::ChannelClosed),
+                Some(_) if !view.transmits() => Err(Refusal::ListenOnly),
+                Some(_) => Ok(()),
+            })
+        })
+        .unwrap_or(Err(Refusal::NoSession))
+    }
+
+    pub(super) fn send(&self, channel: Channel, frames: &[TxFrame]) -> Result<Reply, Refusal> {
+        self.may_transmit_on(channel)?;
+        if frames.iter().any(|frame| frame.tag >= cantap_wire::message::DEVICE_TAG) {
+            return Err(Refusal::BadTag);
+        }
+        let deadline = Instant::now() + ROOM_TIMEOUT;
+        loop {
+            let noted: heapless::Vec<TxFrame, { cantap_wire::message::MAX_SEND }> = {
+                let mut state = self.shared.state();
+                let note =
+                    |frame: &TxFrame| TxFrame { tag: state.note_sent(self.id, channel, *frame), ..*frame };
+                frames.iter().map(note).collect()
+            };
+            let tags: Vec<u32> = noted.iter().map(|frame| frame.tag).collect();
+            let result = self.shared.ask(Command::Send { channel, frames: noted }, Then::Nothing);
+            if result.is_err() {
+                let mut state = self.shared.state();
+                for tag in tags {
+                    state.sent.remove(&tag);
+                }
+            }
+            match result {
+                // Perhaps by another's frames: they leave.
+                Err(Refusal::QueueFull { .. }) if Instant::now() < deadline && !self.outbox.is_closed() => {
+                    std::thread::sleep(Duration::from_millis(2));
+                }
+                result => return result,
+            }
+        }
+    }
+
+    /// Takes the client's frames out of the board's queue. What others have in it is still sent.
+    pub(super) fn withdraw(&self, channel: Channel, is_closed: bool) -> Result<(), Refusal> {
+        {
+            let mut state = self.shared.state();
+            if state.under_way(self.id, channel) == 0 {
+                return Ok(());
+            }
+            for sent in state.sent.values_mut().filter(|sent| sent.channel == channel) {
+                sent.keep = sent.client != self.id;
+                sent.is_closed |= is_closed && sent.client == self.id;
+            }
+        }
+        self.shared.ask(Command::Abort { channel }, Then::Nothing)?;
+        let id = self.id;
+        self.shared
+            .wait_for(WITHDRAW_TIMEOUT, |state| state.under_way(id, channel) == 0 || state.hello.is_none());
+        Ok(())
+    }
+
+    pub(super) fn clear_entries(&self, channel: Channel) {
+        let entries = self.shared.state().entries[channel.index()].of(self.id);
+        for (table, entry) in entries {
+            // If the board does not follow, its thread notices.
+            let _ = self.shared.ask(clears(table, channel, entry), Then::Nothing);
+            self.shared.state().entries[channel.index()].free(table, entry);
+        }
+    }
+
+    pub(super) fn set_periodic(
+        &self,
+        channel: Channel,
+        slot: u8,
+        entry: Option<Periodic>,
+    ) -> Result<Reply, Refusal> {
+        let command = |slot, entry| Command::SetPeriodic { channel, slot, entry };
+        let slots = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.periodic_slots));
+        self.set_entry(Table::Periodic, channel, slot, slots, entry, command)
+    }
+
+    pub(super) fn set_trigger(
+        &self,
+        channel: Channel,
+        slot: u8,
+        entry: Option<Trigger>,
+    ) -> Result<Reply, Refusal> {
+        let command = |slot, entry| Command::SetTrigger { channel, slot, entry };
+        let slots = self.with(|state, _| state.hello.as_ref().map_or(0, |hello| hello.trigger_slots));
+        self.set_entry(Table::Triggers, channel, slot, slots, entry, command)
+    }
+
+    fn set_entry<E>(
+        &self,
+        table: Table,
+        channel: Channel,
+        slot: u8,
+        slots: u8,
+        entry: Option<E>,
+        command: impl Fn(u8, Option<E>) -> Command,
+    ) -> Result<Reply, Refusal> {
+        if slot >= slots {
+            return Err(Refusal::BadSlot);
+        }
+        let Some(entry) = entry else {
+            let found = self.shared.state().entries[channel.index()].find(table, self.id, slot);
+            let Some(found) = found else { return Ok(Reply::Done) };
+            let done = self.shared.ask(command(found, None), Then::Nothing)?;
+            self.shared.state().entries[channel.index()].free(table, found);
+            return Ok(done);
+        };
+        self.may_transmit_on(channel)?;
+        let (had, taken) = {
+            let entries = &mut self.shared.state().entries[channel.index()];
+            let had = entries.find(table, self.id, slot);
+            (had, entries.take(table, self.id, slot, slots))
+        };
+        // All of the board's are in use, the other clients' among them.
+        let taken = taken.ok_or(Refusal::QueueFull { free: 0 })?;
+        let result = self.shared.ask(command(taken, Some(entry)), Then::Nothing);
+        if result.is_err() && had.is_none() {
+            self.shared.state().entries[channel.index()].free(table, taken);
+        }
+        result
+    }
+}

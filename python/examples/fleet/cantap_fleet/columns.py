@@ -1,0 +1,107 @@
+"""The columns of the datasets: `cantap`'s own, in types that Spark has.
+
+Spark has neither unsigned integers nor nanoseconds: numbers take the next wider type, and beside `time`, in microseconds, there is
+`time_ns`.
+"""
+
+from __future__ import annotations
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+#: Names and Spark's types. The first three are folders.
+COMMON = {
+    "vehicle": "string",
+    "day": "date",
+    "channel": "smallint",
+    "trace": "string",
+    "row": "bigint",
+    "time": "timestamp",
+    "time_ns": "bigint",
+    "event": "string",
+    "detail": "string",
+    "count": "bigint",
+    "at_least": "boolean",
+    "tx_errors": "smallint",
+    "rx_errors": "smallint",
+    "tag": "bigint",
+    "id": "int",
+    "extended": "boolean",
+}
+FRAMES = COMMON | {
+    "remote": "boolean",
+    "fd": "boolean",
+    "brs": "boolean",
+    "esi": "boolean",
+    "late": "boolean",
+    "direction": "string",
+    "dlc": "smallint",
+    "data": "binary",
+}
+SIGNALS = COMMON | {
+    "message": "string",
+    "signal": "string",
+    "value": "double",
+    "raw": "decimal(20,0)",
+    "text": "string",
+    "unit": "string",
+}
+FOLDERS = ["vehicle", "day", "channel"]
+#: A task hands over rows of both, and its part of the ledger, in one stream: `part` says which.
+STREAM = {"part": "string"} | FRAMES | SIGNALS | {"entry": "string"}
+
+_ARROW: dict[str, pa.DataType] = {
+    "string": pa.string(),
+    "date": pa.date32(),
+    "smallint": pa.int16(),
+    "int": pa.int32(),
+    "bigint": pa.int64(),
+    "boolean": pa.bool_(),
+    "double": pa.float64(),
+    "binary": pa.binary(),
+    "decimal(20,0)": pa.decimal128(20, 0),
+    "timestamp": pa.timestamp("us", tz="UTC"),
+}
+
+
+def ddl(columns: dict[str, str]) -> str:
+    """The columns as Spark takes them."""
+    return ", ".join(f"`{name}` {kind}" for name, kind in columns.items())
+
+
+def schema(columns: dict[str, str]) -> pa.Schema:
+    """The columns as Arrow has them."""
+    return pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
+
+
+STREAM_SCHEMA = schema(STREAM)
+
+
+def rows_of(batch: pa.RecordBatch, part: str, vehicle: str, trace: str, first_row: int) -> pa.RecordBatch:
+    """A batch of `cantap.scan` as rows of the stream; `first_row` is the number of its first within the trace."""
+    rows = batch.num_rows
+    time = batch.column("time")
+    known: dict[str, pa.Array] = {
+        "part": pa.repeat(part, rows),
+        "vehicle": pa.repeat(vehicle, rows),
+        "trace": pa.repeat(trace, rows),
+        "row": pa.array(range(first_row, first_row + rows), pa.int64()),
+        "time_ns": time.cast(pa.int64()),
+        "time": pc.floor_temporal(time, unit="microsecond"),
+        "day": pc.floor_temporal(time, unit="day").cast(pa.timestamp("s", tz="UTC")).cast(pa.date32()),
+    }
+    arrays = []
+    for field in STREAM_SCHEMA:
+        if field.name in known:
+            arrays.append(known[field.name].cast(field.type))
+        elif field.name in batch.schema.names:
+            arrays.append(batch.column(field.name).cast(field.type))
+        else:
+            arrays.append(pa.nulls(rows, field.type))
+    return pa.RecordBatch.from_arrays(arrays, schema=STREAM_SCHEMA)
+
+
+def entry_of(entry: str, vehicle: str, trace: str) -> pa.RecordBatch:
+    """The ledger's entry of a trace as a row of the stream."""
+    row = {"part": "ledger", "vehicle": vehicle, "trace": trace, "entry": entry}
+    return pa.RecordBatch.from_pylist([row], schema=STREAM_SCHEMA)

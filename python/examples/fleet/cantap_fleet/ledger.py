@@ -1,0 +1,63 @@
+"""The ledger: what became of each input."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+#: All of it was read.
+READ = "read"
+#: It ends in the middle of something; all that is before is there.
+CUT = "cut"
+#: Places in it could not be read; the rest is there.
+DAMAGED = "damaged"
+#: It was read to its end, and has nothing in it.
+EMPTY = "empty"
+#: It is no trace, or its vehicle's databases cannot be used. It has no rows.
+REFUSED = "refused"
+#: The system did not deliver it, reading it took too long, or the process that read it died, twice. It has no rows.
+FAILED = "failed"
+
+
+@dataclass
+class Entry:
+    """What became of one input. No times and no machines: running the job again gives the same."""
+
+    trace: str
+    vehicle: str
+    bytes: int
+    state: str = READ
+    #: In words, what is wrong; of several places the first.
+    problem: str | None = None
+    format: str | None = None
+    #: Rows among the frames: frames, losses, bus errors, states.
+    records: int = 0
+    frames: int = 0
+    #: Frames that the trace says are missing in it, or more.
+    lost: int = 0
+    lost_at_least: bool = False
+    bus_errors: int = 0
+    #: Frames that the databases have a message for.
+    decoded: int = 0
+    #: Rows among the signals.
+    signal_rows: int = 0
+    #: Places that could not be read, and the first of them in words.
+    issues: int = 0
+    faults: list[str] = field(default_factory=list)
+    #: What is well-formed and no part of a CAN trace, by kind.
+    left_out: dict[str, int] = field(default_factory=dict)
+    #: What is nothing wrong and should be known, by kind.
+    notes: dict[str, int] = field(default_factory=dict)
+    databases: list[str] = field(default_factory=list)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON and for Spark."""
+        return asdict(self)
+
+
+#: The same, as Spark has it.
+DDL = (
+    "trace string, vehicle string, bytes bigint, state string, problem string, format string, records bigint, frames bigint, "
+    "lost bigint, lost_at_least boolean, bus_errors bigint, decoded bigint, signal_rows bigint, issues bigint, "
+    "faults array<string>, left_out map<string, bigint>, notes map<string, bigint>, databases array<string>"
+)

@@ -1,0 +1,215 @@
+#!/bin/sh
+# shellcheck shell=dash
+# `cantap bridge`: both channels at interfaces of the kernel's own, under can-utils and python-can.
+
+has_port || attach
+modprobe -a vcan vxcan
+
+# bridge OPTION...: in the background, as $BRIDGE, until programs may use it.
+bridge() {
+  "$CANTAP" bridge -d "$PORT" -b 1M "$@" > bridge.out 2> bridge.err &
+  BRIDGE=$!
+  wait_until grep -q "Ctrl-C ends it" bridge.err || { cat bridge.err; return 1; }
+}
+end_bridge() {
+  kill -INT "$BRIDGE"
+  wait "$BRIDGE" || { cat bridge.err; return 1; }
+  tail -n 2 bridge.err
+}
+
+# listen INTERFACE...: candump on each in the background, with room for a burst at full load, errors among the frames.
+listen() {
+  LISTENERS=
+  for _interface in "$@"; do
+    candump -L -r 8000000 "$_interface,0:0,#FFFFFFFF" > "$_interface.txt" &
+    LISTENERS="$LISTENERS $!"
+  done
+  sleep 0.5
+}
+# quiet: waits until no frame crosses any more. (A session has bytes on the wire all the time.)
+quiet() {
+  _before=none
+  while _now="$(both taken) $(both sent)" && [ "$_before" != "$_now" ]; do
+    _before=$_now
+    sleep 1
+  done
+}
+# heard: waits until nothing more comes.
+heard() {
+  quiet
+  sleep 0.5
+  # shellcheck disable=SC2086 # several
+  kill $LISTENERS
+  # shellcheck disable=SC2086
+  wait $LISTENERS 2> /dev/null
+}
+# frames FILE: a candump log's frames, without errors, and without a DLC above 8, which not every version of candump prints.
+frames() { awk '{ print $3 }' "$1" | grep -v '^2[0-9A-F]\{7\}#' | bare; }
+bare() { sed 's/#R.*$/#R/; s/_[0-9A-F]$//'; }
+errors() { awk '{ print $3 }' "$1" | grep -c '^2[0-9A-F]\{7\}#'; }
+
+"$CANTAP" bridge -d "$PORT" -b 1M bus0 2> bridge.err
+[ $? = 1 ] && grep -q "ip link add bus0 type vcan && ip link set bus0 up" bridge.err
+verdict $? "bridge: without an interface, the line for root is there"
+
+# The line itself, with the program that knows of CAN.
+for _bus in bus0 bus1; do
+  iproute2 link add $_bus type vcan && ip link set $_bus up
+done
+
+for _job in "50 mix" "100 mix" "100 std0"; do
+  board traffic 0 mix
+  bridge bus0 bus1
+  listen bus0 bus1
+  board mark
+  # shellcheck disable=SC2086 # words
+  board play 1 $_job 4000
+  # shellcheck disable=SC2086
+  board play 2 $_job 4000
+  heard
+  board dump bridge
+  _bad=0
+  for _n in 1 2; do
+    frames bus$((_n - 1)).txt > got$_n
+    bare < /share/bridge.taken$_n | cmp -s - got$_n || _bad=1
+    [ "$(wc -l < got$_n)" = 4000 ] || _bad=1
+  done
+  verdict $_bad "bridge, candump: $_job" "$(wc -l < got1) + $(wc -l < got2) frames in order"
+  check "bridge: ends with Ctrl-C" end_bridge
+done
+
+# Both channels at once, for as long as it takes.
+board traffic 100 std0
+bridge bus0 bus1
+listen bus0 bus1
+board mark
+sleep 6
+board dump bridge
+board traffic 0 std0
+sleep 1
+# shellcheck disable=SC2086 # several
+kill $LISTENERS
+# shellcheck disable=SC2086
+wait $LISTENERS 2> /dev/null
+_bad=0
+for _n in 1 2; do
+  frames bus$((_n - 1)).txt > got$_n
+  bare < /share/bridge.taken$_n > want$_n
+  _count=$(wc -l < want$_n)
+  # candump listened before the books were begun, and longer.
+  awk -v want="$(head -n 8 want$_n | tr '\n' ' ')" '
+    on { print; next }
+    { last[NR % 8] = $0; line = ""; for (i = 1; i <= 8; i++) line = line last[(NR + i) % 8] " " }
+    line == want { on = 1; for (i = 1; i <= 8; i++) print last[(NR + i) % 8] }
+  ' < got$_n | head -n "$_count" | cmp -s - want$_n || _bad=1
+  [ "$_count" -gt 1000 ] || _bad=1
+done
+verdict $_bad "bridge, candump: both channels at 100 %, shortest frames" "$(wc -l < want1) + $(wc -l < want2) frames in order"
+end_bridge
+
+# Who only listens sends nothing, and is told so.
+board traffic 0 mix
+bridge bus0
+listen bus0
+board mark
+cansend bus0 123#11
+sleep 1
+heard
+[ "$(both dominant_bits)" = "0 0" ] && [ "$(errors bus0.txt)" = 1 ] && grep -q "channel 1 only listens" bridge.err
+verdict $? "bridge: a channel that only listens sends nothing and says so" "$(errors bus0.txt) error frame"
+end_bridge
+
+bridge --mode normal bus0 bus1
+board mark
+: > wanted.txt
+for _frame in 123#DEADBEEF 1F334455#1122334455667788 7FF#R 000# 5A1#01; do
+  cansend bus0 $_frame
+  cansend bus1 $_frame
+  echo $_frame >> wanted.txt
+done
+sleep 1
+board dump bridge
+_bad=0
+for _n in 1 2; do bare < /share/bridge.sent$_n | cmp -s - wanted.txt || _bad=1; done
+verdict $_bad "bridge, cansend: both buses saw all of them"
+
+board mark
+listen bus0
+board play 1 60 std8 2000
+cangen -g 0 -n 500 -e -I 1234567 -L 8 -D i -p 10 bus0
+heard
+board dump bridge
+frames bus0.txt > heard.txt
+grep -v '^01234567#' heard.txt | cmp -s - /share/bridge.taken1 &&
+  [ "$(grep -c '^01234567#' heard.txt)" = 500 ] &&
+  grep '^01234567#' heard.txt | cmp -s - /share/bridge.sent1
+verdict $? "bridge, cangen against 60 %: each frame once" "$(wc -l < /share/bridge.taken1) heard, $(wc -l < /share/bridge.sent1) sent"
+
+listen bus0
+board noise 30
+board play 1 50 mix 300
+quiet
+board noise 0
+board acknowledge no
+cansend bus0 123#22
+sleep 1
+heard
+board acknowledge yes
+[ "$(errors bus0.txt)" -gt 20 ] && grep -q ' 20000204#' bus0.txt
+verdict $? "bridge: bus errors and states are error frames" "$(errors bus0.txt) of them"
+
+cat > program.py << 'PROGRAM'
+import can, sys
+bus = can.Bus(interface="socketcan", channel="bus0")
+print("ready", flush=True)
+# As many as fit its socket.
+frames = [bus.recv(30) for _ in range(150)]
+assert all(frame is not None and not frame.is_error_frame for frame in frames), len([frame for frame in frames if frame])
+assert any(frame.is_extended_id for frame in frames) and any(frame.dlc == 0 for frame in frames)
+for number in range(20):
+    bus.send(can.Message(arbitration_id=0x1ABBCC00 + number, data=[number, 0xFF], is_extended_id=True))
+bus.shutdown()
+print("done", flush=True)
+PROGRAM
+if python3 -c "import can" 2> python.err; then
+  sleep 1
+  board mark
+  python3 program.py > python.out 2> python.err &
+  _python=$!
+  wait_until grep -q ready python.out || wait_until grep -q ready python.out
+  board play 1 50 mix 150
+  wait $_python
+  sleep 1
+  board dump bridge
+  grep -q done python.out && [ "$(grep -c '^1ABBCC[01].#' /share/bridge.sent1)" = 20 ]
+  verdict $? "bridge, python-can: hears 150 frames and sends 20"
+  cat python.err
+else
+  echo "SKIPPED: this guest has no python-can: $(tail -n 1 python.err)"
+fi
+end_bridge
+
+# A pair: programs are at its other end, in whatever network namespace. Their frames come back once: by the kernel, or as the confirmation.
+iproute2 link add bus2 type vxcan peer name app2 && ip link set bus2 up && ip link set app2 up
+bridge --mode normal bus2
+listen app2
+board mark
+board play 1 30 std8 100
+cangen -g 1 -n 50 -e -I 1234567 -L 2 -D i -p 10 app2
+heard
+frames app2.txt > heard.txt
+[ "$(grep -c '^01234567#' heard.txt)" = 50 ] && [ "$(wc -l < heard.txt)" = 150 ]
+verdict $? "bridge, vxcan: each frame once" "$(wc -l < heard.txt) frames, flags $(cat /sys/class/net/app2/flags)"
+
+# Killed: the board leaves its buses.
+board traffic 50 mix
+sleep 1
+kill -9 "$BRIDGE"
+wait "$BRIDGE" 2> /dev/null
+sleep 1
+board mark
+sleep 1
+[ "$(both dominant_bits)" = "0 0" ]
+verdict $? "bridge: killed, and the board is silent"
+capture_is_exact "a capture after the bridge"
+iproute2 link del bus2

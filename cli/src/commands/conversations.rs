@@ -73,7 +73,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut batch = Vec::new();
     loop {
         let more = records.next_batch(&mut batch)?;
-        batch.iter().for_each(|record| summary.record(record));
+        for record in &batch {
+            summary.record(record);
+        }
         reading.take(&batch, more, |event| {
             summary.event(&event);
             if !args.faults || event.is_fault() { write(&mut out, &event, args.json) } else { Ok(()) }

@@ -79,7 +79,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     } else {
         print(args, &difference, &mut out)?;
         if let Some(protocols) = &protocols {
-            protocols.print([&args.a, &args.b].map(|path| path.display().to_string()), &mut out)?;
+            protocols.print(&[&args.a, &args.b].map(|path| path.display().to_string()), &mut out)?;
         }
     }
     out.flush()?;
@@ -93,7 +93,9 @@ fn profile(args: &Args, path: &Path) -> anyhow::Result<(Profile, Missing, Option
     let mut known = args.protocols.then(|| args.protocol.known(false)).transpose()?;
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
-        batch.iter().for_each(|record| profile.add(record));
+        for record in &batch {
+            profile.add(record);
+        }
         if let Some(known) = &mut known {
             known.take(&batch, true);
         }

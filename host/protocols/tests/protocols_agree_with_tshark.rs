@@ -140,7 +140,7 @@ fn iso15765_frames_and_messages() {
     let (mut messages, mut long) = (0, 0);
     for ((frame, row), events) in frames.iter().zip(&rows).zip(events(&frames, Protocol::IsoTp)) {
         let is = |name: &str, value: u32| {
-            assert_eq!(number(row, name), Some(f64::from(value)), "{frame} {name} {row:?}")
+            assert_eq!(number(row, name), Some(f64::from(value)), "{frame} {name} {row:?}");
         };
         match parse(frame.data(), 0).unwrap().unwrap() {
             Pci::Single(data) => {

@@ -62,7 +62,7 @@ impl Protocols {
             && self.values.is_empty()
     }
 
-    pub fn print(&self, names: [String; 2], out: &mut impl Write) -> std::io::Result<()> {
+    pub fn print(&self, names: &[String; 2], out: &mut impl Write) -> std::io::Result<()> {
         let name = |(channel, protocol, node): &Node| match channel {
             0 => format!("{protocol} node {node}"),
             channel => format!("channel {channel}, {protocol} node {node}"),

@@ -388,7 +388,10 @@ mod tests {
             let mut node = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };
             run(&mut bus, 1_000_000_000, &mut [&mut node]);
             let before = node.seen.len();
-            assert_eq!(bus.next_event_ns(1_000_000_000, &[]), NEVER);
+            // The frame that is on the bus ends, and then there is nobody.
+            let end_ns = bus.next_event_ns(1_000_000_000, &[]);
+            bus.step(end_ns, &mut []);
+            assert_eq!(bus.next_event_ns(1_001_000_000, &[]), NEVER);
             assert_eq!(bus.next_event_ns(5_000_000_000, &[]), NEVER);
             let mut now_ns = 8_000_000_000;
             let mut again = FakeNode { bitrate_bps: 500_000, ..FakeNode::new(None) };

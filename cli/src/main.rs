@@ -20,6 +20,7 @@ macro_rules! eprint {
     }};
 }
 
+mod address;
 mod advice;
 mod args;
 mod beside;
@@ -45,6 +46,7 @@ mod progress;
 mod protocols;
 mod rescue;
 mod sending;
+mod server;
 mod shells;
 mod speaking;
 mod stderr;
@@ -59,8 +61,6 @@ mod wrong;
 use std::error::Error;
 use std::process::ExitCode;
 
-use cantap_address as address;
-use cantap_address::server;
 use clap::{CommandFactory, Parser};
 use clap_complete::CompleteEnv;
 

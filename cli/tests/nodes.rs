@@ -153,6 +153,16 @@ fn a_node_on_python_canopen_is_found_read_written_and_commanded() {
         std::fs::read(rig.folder.path().join("object.bin")).unwrap(),
         b"written_in_more_than_one_frame"
     );
+    let (code, _, err) = rig.run("canopen read 5 2000 -o object.bin");
+    assert!(code == Some(1) && err.contains("nothing there is overwritten"), "{err}");
+    assert_eq!(rig.run("canopen read 5 3000 -o nothing.bin").0, Some(1));
+    assert!(!rig.folder.path().join("nothing.bin").exists());
+    // A sheet tells types and names.
+    let sheet = "[DeviceInfo]\nProductName=Node\n[2001]\nParameterName=Counter\nObjectType=0x7\nDataType=0x0007\nAccessType=rw\n";
+    std::fs::write(rig.folder.path().join("node.eds"), sheet).unwrap();
+    rig.well("canopen write 5 2001 0 123456 --eds 5:node.eds");
+    let out = rig.well("canopen read 5 2001 --eds 5:node.eds");
+    assert!(out.contains("Counter") && out.contains("value 123456"), "{out}");
     assert!(rig.well("canopen read 5 2001 --sdo 605:585").contains("0x0001E240"));
     let (code, _, err) = rig.run("canopen read 5 3000");
     assert!(code == Some(1) && err.contains("object does not exist (06020000)"), "{err}");

@@ -56,7 +56,7 @@ fn a_search_finds_the_frame_that_completes_what_was_said() {
     assert_eq!((code, &*out), (Some(1), ""));
     assert!(err.contains("nothing had uds.nrcc; `cantap conversations` shows"), "{err}");
     let (code, _, err) = search(&["usd.nrc"]);
-    assert!(code == Some(1) && err.contains("usd.nrc"), "{code:?} {err}");
+    assert!(code == Some(2) && err.contains("usd.nrc"), "{code:?} {err}");
     let (_, out, _) = search(&["uds.did == 0xF190", "--json"]);
     let found: Value = serde_json::from_str(out.lines().next().unwrap()).unwrap();
     assert!(found["said"][0].as_str().unwrap().contains("WVWZZZ1KZAW000001"), "{found}");

@@ -189,7 +189,7 @@ fn ssh(folder: &Path) -> PathBuf {
     let program = folder.join("ssh");
     std::fs::write(
         &program,
-        "#!/bin/sh\n[ \"$1 $2 $3\" = '-T -oBatchMode=yes --' ] || exit 255\nshift 4\nexec sh -c \"$*\"\n",
+        "#!/bin/sh\n[ \"$1 $2 $3\" = '-T -oBatchMode=yes --' ] || exit 255\nshift 4\nsleep ${FAR:-0}\nexec sh -c \"$*\"\n",
     )
     .unwrap();
     std::fs::set_permissions(&program, std::fs::Permissions::from_mode(0o755)).unwrap();
@@ -222,6 +222,9 @@ fn a_capture_through_ssh_is_one_made_beside_it() {
     assert!(err.contains("the right to send"), "{err}");
     let (code, _, err) = send("ssh://there/virtual?allow=send");
     assert_eq!(code, Some(0), "{err}");
+    // A computer that it takes long to get to.
+    let far_away = through(cantap("info -d ssh://there/virtual").env("FAR", "4")).wait_with_output().unwrap();
+    assert_eq!(far_away.status.code(), Some(0), "{}", String::from_utf8_lossy(&far_away.stderr));
     // Ctrl-C ends the capture, and then the other side: whole, with its summary.
     let mut interrupted =
         through(&mut capture("ssh://there/virtual:load=50", &folder.path().join("c.log"), "-b 500k"));

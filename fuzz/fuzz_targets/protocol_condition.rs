@@ -6,9 +6,9 @@ use cantap_fuzz::{id, record};
 use cantap_protocols::{Options, condition};
 use cantap_signals::Decoder;
 
-libfuzzer_sys::fuzz_target!(|input: (&str, Vec<(u32, u16, Vec<u8>)>)| {
+libfuzzer_sys::fuzz_target!(|input: (String, Vec<(u32, u16, Vec<u8>)>)| {
     let (text, frames) = input;
-    let Ok(mut condition) = condition(text, &Decoder::new(Vec::new()), &Options::default()) else { return };
+    let Ok(mut condition) = condition(&text, &Decoder::new(Vec::new()), &Options::default()) else { return };
     let mut time_ns = 0_i64;
     for (number, after_100us, data) in frames {
         time_ns += i64::from(after_100us) * 100_000;

@@ -248,14 +248,12 @@ impl Record {
     fn __repr__(&self) -> String {
         let TraceRecord { time_ns, channel, .. } = self.0;
         let seconds = format!("{}.{:06}", time_ns / 1_000_000_000, time_ns / 1000 % 1_000_000);
-        match self.frame() {
-            Some(frame) => format!("<cantap.Record {seconds} channel {channel} {frame}>"),
-            None => {
-                let detail = self.detail().map_or_else(String::new, |detail| format!(" {detail}"));
-                let count = self.count().map_or_else(String::new, |count| format!(" {count}"));
-                format!("<cantap.Record {seconds} channel {channel} {}{detail}{count}>", self.event())
-            }
+        if let Some(frame) = self.frame() {
+            return format!("<cantap.Record {seconds} channel {channel} {frame}>");
         }
+        let detail = self.detail().map_or_else(String::new, |detail| format!(" {detail}"));
+        let count = self.count().map_or_else(String::new, |count| format!(" {count}"));
+        format!("<cantap.Record {seconds} channel {channel} {}{detail}{count}>", self.event())
     }
 }
 

@@ -18,14 +18,14 @@ use crate::table::{Table, stream_capsule};
 
 /// What rows are made of.
 enum Columns {
-    Frames(FrameColumns),
+    Frames(Box<FrameColumns>),
     Values { table: Box<SignalColumns>, decoder: Arc<Decoder>, values: Vec<SignalValue>, chosen: bool },
 }
 
 impl Columns {
     fn new(options: &Options) -> Result<Self, Error> {
         Ok(match options.decoder()? {
-            None => Self::Frames(FrameColumns::default()),
+            None => Self::Frames(Box::default()),
             Some(decoder) => Self::Values {
                 table: Box::new(SignalColumns::new(&decoder)),
                 decoder,

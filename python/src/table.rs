@@ -23,6 +23,9 @@ const STREAM: &CStr = c"arrow_array_stream";
 const SCHEMA: &CStr = c"arrow_schema";
 const ARRAY: &CStr = c"arrow_array";
 
+/// What pickle makes a table of again.
+type Reduced<'py> = (Py<PyAny>, (Bound<'py, PyBytes>, Option<Py<Report>>));
+
 /// A table in memory, in one or several batches.
 #[pyclass(module = "cantap", frozen)]
 pub struct Table {
@@ -162,10 +165,7 @@ impl Table {
         Ok((self.__arrow_c_schema__(py)?, PyCapsule::new_with_value(py, array, ARRAY)?))
     }
 
-    fn __reduce__<'py>(
-        &self,
-        py: Python<'py>,
-    ) -> PyResult<(Py<PyAny>, (Bound<'py, PyBytes>, Option<Py<Report>>))> {
+    fn __reduce__<'py>(&self, py: Python<'py>) -> PyResult<Reduced<'py>> {
         let written = py.detach(|| {
             let mut writer = StreamWriter::try_new(Vec::new(), &self.schema)?;
             self.batches.iter().try_for_each(|batch| writer.write(batch))?;

@@ -47,13 +47,13 @@ fn walk(
 
 /// Statistics of a trace, as `cantap stats --json` has them.
 #[pyfunction]
-pub fn stats<'py>(
-    py: Python<'py>,
+pub fn stats(
+    py: Python<'_>,
     options: Options,
     bitrates: Vec<(Option<u8>, u32)>,
     data_bitrates: Vec<(Option<u8>, u32)>,
     window_s: f64,
-) -> PyResult<Bound<'py, PyAny>> {
+) -> PyResult<Bound<'_, PyAny>> {
     let all = |rates: &[(Option<u8>, u32)]| {
         rates.iter().find(|(channel, _)| channel.is_none()).map(|(_, rate)| *rate)
     };

@@ -73,8 +73,8 @@ def test_databases_are_read_once_and_signals_are_chosen(log, dbc):
         table = cantap.read(log, db=db, signals="Gear")
         assert [row["signal"] for row in rows(table)] == [None, "Gear"]
     assert len(cantap.read(log, db={2: dbc})) == 1
-    with pytest.raises(cantap.DatabaseError, match="Spead"):
-        cantap.read(log, db=database, signals="Spead")
+    with pytest.raises(cantap.DatabaseError, match="Nonsense"):
+        cantap.read(log, db=database, signals="Nonsense")
     with pytest.raises(ValueError, match="db="):
         cantap.read(log, signals="Speed")
 

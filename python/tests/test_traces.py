@@ -22,7 +22,7 @@ def test_decoding_gives_a_table_for_each_message(log, dbc):
     assert [row["event"] for row in rows(decoded.events)] == ["bus-error"]
     assert decoded.report.decoded == 2
     with pytest.raises(ValueError, match="no column"):
-        engine.column_metadata("Spead")
+        engine.column_metadata("Nonsense")
 
 
 def test_tables_of_records_are_decoded_too(log, dbc):
@@ -45,7 +45,7 @@ def test_what_is_looked_for_is_found_with_its_place(log, dbc):
     assert [row["place"] for row in rows(cantap.search(log, id=["123", "7FF"], max_count=2))] == [0, 1]
     assert [row["place"] for row in rows(cantap.search(log, data="* 02"))] == [2]
     assert [row["place"] for row in rows(cantap.search(log, "error"))] == [3]
-    for arguments in ({}, {"condition": "Speed >"}, {"condition": "Spead > 1", "db": dbc}, {"id": "xyz"}, {"data": "1"}):
+    for arguments in ({}, {"condition": "Speed >"}, {"condition": "Nonsense > 1", "db": dbc}, {"id": "xyz"}, {"data": "1"}):
         with pytest.raises(ValueError):
             cantap.search(log, **arguments)
 

@@ -7,6 +7,7 @@ use cantap_protocols::active::station::{Station, StationError, StationJob};
 use cantap_protocols::j1939::J1939;
 use cantap_protocols::{Event, Party};
 
+use super::uds::hex::{self, Hex};
 use crate::databases::DatabaseArgs;
 use crate::speaking::{SpeakArgs, Speaking};
 use crate::wrong::wrong;
@@ -85,7 +86,7 @@ enum What {
 struct Bytes(Vec<u8>);
 
 fn bytes(text: &str) -> Result<Bytes, String> {
-    let super::uds::Hex(data) = super::uds::bytes(text)?;
+    let Hex(data) = hex::bytes(text)?;
     if data.len() > MOST_BYTES {
         Err(format!("a message has at most {MOST_BYTES} bytes"))
     } else {

@@ -381,7 +381,11 @@ fn serve_stdio(board: &Board, role: Role) -> anyhow::Result<ExitCode> {
             }
         }
     })?;
-    board.admit(input, io::stdout(), "the client", role)?;
+    let mut stdout = io::stdout();
+    // The client has waited for this: to get here took as long as it took.
+    stdout.write_all(&connect::READY)?;
+    stdout.flush()?;
+    board.admit(input, stdout, "the client", role)?;
     while board.clients() > 0 && !interrupt::requested() {
         std::thread::sleep(LOOK_EVERY);
     }

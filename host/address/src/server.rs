@@ -94,8 +94,15 @@ impl Server {
             Self::Ssh(ssh) => {
                 let mut command = ssh.command();
                 let program = command.get_program().to_string_lossy().into_owned();
-                return connect::program(&mut command).with_context(|| {
-                    format!("'{program}' does not start; install it, or name another in CANTAP_SSH")
+                return connect::program(&mut command).map_err(|error| match error.kind() {
+                    ErrorKind::TimedOut => anyhow::anyhow!(
+                        "'{}': no server there answers ({error}); try `{program} {} cantap serve --stdio` by hand",
+                        ssh.host,
+                        ssh.host
+                    ),
+                    _ => anyhow::anyhow!(
+                        "'{program}' does not start ({error}); install it, or name another in CANTAP_SSH"
+                    ),
                 });
             }
         };

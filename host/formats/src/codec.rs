@@ -65,7 +65,7 @@ pub(crate) trait Encode: Send {
     /// Appends what was held back, so that a file ending here is valid.
     fn flush(&mut self, _out: &mut Vec<u8>, _left_out: &mut LeftOut) {}
 
-    /// Bytes that [`Self::flush`] would append at most.
+    /// Bytes that [`Self::flush`] or [`Self::finish`] would append at most, where that is much.
     fn held_back(&self) -> usize {
         0
     }

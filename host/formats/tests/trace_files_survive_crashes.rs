@@ -51,9 +51,12 @@ fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
             let same = directory.join(format!("whole-{}", file_name(format, "")));
             write(&same, format, &records[..left.len()]);
             assert!(left == read(&same).0, "{place}");
-            // Nothing of a provisional end may be left between the rows.
+            // Nothing of a provisional end may be left between the rows. Statistics at the end of a pcapng file are no part of it: whoever
+            // reads it while it grows has read on behind them.
             if compression.is_empty() && !matches!(format, Format::Blf) {
-                assert!(fs::read(&path).unwrap() == fs::read(&same).unwrap(), "{place}");
+                let (left, whole) = (fs::read(&path).unwrap(), fs::read(&same).unwrap());
+                assert!(whole.starts_with(&left), "{place}");
+                assert!(left.len() == whole.len() || format == Format::Pcapng, "{place}");
             }
             test_by_its_own_program(&path);
         }

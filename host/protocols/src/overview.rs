@@ -191,7 +191,7 @@ impl Overview {
                 let state = event.title.rsplit(": ").next().unwrap_or_default();
                 node.state = Some(state.to_owned());
             }
-            "heartbeat_missing" | "guard_missing" => {
+            "heartbeat_missing" | "guard_missing" | "guarding_stopped" => {
                 node.missed += 1;
                 node.state = Some(event.title.to_string());
                 node.period_ms = number(event, "period_ms").or(node.period_ms);

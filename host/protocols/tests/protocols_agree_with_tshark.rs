@@ -8,7 +8,7 @@ use std::process::Command;
 
 use cantap_protocols::iso_tp::{FlowStatus, Pci, parse};
 use cantap_protocols::j1939::Header;
-use cantap_protocols::{Conversations, Event, Options, Protocol, Value};
+use cantap_protocols::{Conversations, Event, Options, Protocol};
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
 const BOAT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../formats/tests/data/nmea2000.log.gz");
@@ -45,8 +45,8 @@ fn tshark(test: &str, frames: &[TraceFrame], decode_as: &[&str], fields: &[&str]
     std::fs::write(&path, pcap).unwrap();
     let mut command = Command::new("tshark");
     command.arg("-r").arg(&path).args(["-T", "fields", "-E", "separator=|", "-E", "occurrence=l"]);
-    decode_as.iter().for_each(|rule| drop(command.args(["-d", rule])));
-    fields.iter().for_each(|field| drop(command.args(["-e", field])));
+    command.args(decode_as.iter().flat_map(|rule| ["-d", rule]));
+    command.args(fields.iter().flat_map(|field| ["-e", field]));
     let output = command.output().unwrap();
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
     let rows: Vec<Row> = String::from_utf8(output.stdout)
@@ -438,7 +438,9 @@ fn j1939_headers() {
         let header = Header::of(frame.id()).unwrap();
         let all = [u32::from(header.priority), header.pgn, header.source.into(), header.destination.into()];
         for (name, ours) in names.iter().zip(all) {
-            assert_eq!(number(row, name), Some(f64::from(ours)), "{frame} {name} {row:?}");
+            // Of groups that go to all it has no receiver.
+            let theirs = number(row, name).or((*name == "j1939.dst_addr").then_some(255.0));
+            assert_eq!(theirs, Some(f64::from(ours)), "{frame} {name} {row:?}");
         }
     }
 }
@@ -479,11 +481,11 @@ fn isobus_transport() {
         format!("{transport}.request_to_send.total_size"),
         format!("{transport}.request_to_send.pgn"),
         "isobus.src_addr".to_owned(),
-        "isobus.reassembled.length".to_owned(),
     ];
     let names: Vec<_> = names.iter().map(String::as_str).collect();
     let Some(rows) = tshark("isobus", &frames, &["can.subdissector,isobus"], &names) else { return };
-    let (mut announced, mut whole, mut reassembled) = (None, 0, 0);
+    // Its own length of what it put together counts padding in, so the announced one is compared.
+    let (mut announced, mut whole) = (None, 0);
     for (row, events) in rows.iter().zip(events(&frames, Protocol::J1939)) {
         let either = |a: usize, b: usize| number(row, names[a]).or_else(|| number(row, names[b]));
         announced = either(0, 2).zip(either(1, 3)).or(announced);
@@ -492,12 +494,8 @@ fn isobus_transport() {
             let (size, pgn) = announced.unwrap();
             assert_eq!((ours(event, "length"), ours(event, "pgn")), (Some(size), Some(pgn)), "{event}");
             assert_eq!(number(row, "isobus.src_addr"), event.node().map(f64::from));
-            if let Some(length) = number(row, "isobus.reassembled.length") {
-                assert_eq!(length, event.data.len() as f64);
-                reassembled += 1;
-            }
             whole += 1;
         }
     }
-    assert_eq!(whole, 30, "{reassembled}");
+    assert_eq!(whole, 30);
 }

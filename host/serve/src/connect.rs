@@ -15,6 +15,10 @@ use cantap::device::{Link, pipe};
 pub(crate) const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
 /// A computer that does not answer is given up after this time.
 const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
+/// A server that a program starts on another computer is ready by then: ssh has to get there, and the board has to greet it.
+const START_TIMEOUT: Duration = Duration::from_secs(30);
+/// What such a server says first, when it is ready: the end of no message.
+pub const READY: [u8; 1] = [0];
 /// Bytes of a program's output that wait at most.
 const PIPE_BYTES: usize = 256 * 1024;
 
@@ -66,8 +70,8 @@ pub(crate) fn prepare(stream: &TcpStream) -> io::Result<()> {
     stream.set_nodelay(true)
 }
 
-/// To a server that a program is: through its standard input and output. What it says on standard error, the user sees. It ends with the
-/// link.
+/// To a server that a program is: through its standard input and output, when it has said [`READY`]. What it says on standard error, the user
+/// sees. It ends with the link. A program that has ended makes a link that is closed.
 pub fn program(command: &mut Command) -> io::Result<Link> {
     let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
     let (Some(writer), Some(mut output)) = (child.stdin.take(), child.stdout.take()) else {
@@ -85,6 +89,9 @@ pub fn program(command: &mut Command) -> io::Result<Link> {
             }
         }
     })?;
+    if !reader.wait_for_bytes(START_TIMEOUT) && !reader.is_closed() {
+        return Err(io::Error::new(io::ErrorKind::TimedOut, "it is not ready after 30 s"));
+    }
     Ok(Link::new(reader, writer).keeping(child))
 }
 

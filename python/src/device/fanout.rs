@@ -183,8 +183,10 @@ pub struct Fanout {
 #[derive(Default)]
 struct Listeners {
     all: Vec<Weak<Listener>>,
-    /// Nothing follows, for this reason if there is one.
-    ended: Option<Option<String>>,
+    /// Nothing follows.
+    has_ended: bool,
+    /// For this reason, if it is not that it was asked for.
+    failure: Option<String>,
 }
 
 impl Fanout {
@@ -192,9 +194,10 @@ impl Fanout {
     pub fn listen(&self, wanted: Wanted, capacity: usize) -> Arc<Listener> {
         let listener = Arc::new(Listener::new(wanted, capacity));
         let mut listeners = lock(&self.listeners);
-        match &listeners.ended {
-            Some(failure) => listener.end(failure.clone()),
-            None => listeners.all.push(Arc::downgrade(&listener)),
+        if listeners.has_ended {
+            listener.end(listeners.failure.clone());
+        } else {
+            listeners.all.push(Arc::downgrade(&listener));
         }
         listener
     }
@@ -233,7 +236,8 @@ impl Fanout {
         for listener in listeners.all.drain(..).filter_map(|listener| listener.upgrade()) {
             listener.end(failure.clone());
         }
-        listeners.ended = Some(failure);
+        listeners.has_ended = true;
+        listeners.failure = failure;
     }
 
     /// Tells how transmissions end, until no more do. For a thread of its own.

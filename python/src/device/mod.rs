@@ -37,7 +37,7 @@ const MODES: [(Mode, &str); 4] = [
     (Mode::SilentLoopback, "silent-loopback"),
 ];
 /// A frame that has not ended after this time will not by itself.
-const MOST_TIME: Duration = Duration::from_secs(24 * 3600);
+const MOST_TIME: Duration = Duration::from_hours(24);
 
 /// A device in a session of this program.
 #[pyclass(module = "cantap", frozen, weakref)]
@@ -69,6 +69,7 @@ pub fn channel(number: u8) -> Result<Channel, Error> {
 }
 
 /// Lets Python's signals through.
+#[expect(clippy::redundant_closure_for_method_calls, reason = "the method is for one lifetime")]
 pub fn signals() -> Result<(), Error> {
     Python::attach(|py| py.check_signals()).map_err(Error::Python)
 }
@@ -165,7 +166,8 @@ impl Device {
                 );
                 return Err(Error::argument(words));
             };
-            let filters = options.filters.iter().map(|text| text.parse::<Filter>()).collect::<Result<Vec<_>, _>>();
+            let filters =
+                options.filters.iter().map(|text| text.parse::<Filter>()).collect::<Result<Vec<_>, _>>();
             let filters = filters.map_err(Error::argument)?;
             let clock_hz = device.hello().can_clock_hz;
             let request = match options.segments {
@@ -177,17 +179,14 @@ impl Device {
                     TimingRequest::Rate { bitrate_bps, sample_point_percent, sjw: options.sjw }
                 }),
             };
-            let timing = match request {
-                Some(request) => request.resolve(clock_hz).map_err(Error::argument)?,
-                None => match device.defaults(channel)? {
-                    Some(saved) => saved.config.timing,
-                    None => {
-                        let words = format!(
-                            "nothing is saved on the device for channel {number}; give bitrate=, such as 500_000"
-                        );
-                        return Err(Error::argument(words));
-                    }
-                },
+            let timing = if let Some(request) = request {
+                request.resolve(clock_hz).map_err(Error::argument)?
+            } else if let Some(saved) = device.defaults(channel)? {
+                saved.config.timing
+            } else {
+                return Err(Error::argument(format!(
+                    "nothing is saved on the device for channel {number}; give bitrate=, such as 500_000"
+                )));
             };
             let config = ChannelConfig {
                 mode: *mode,
@@ -404,8 +403,8 @@ impl Device {
     }
 
     /// Closes the channels and ends the session; records that came can still be read.
-    fn close(&self, py: Python<'_>) -> PyResult<()> {
-        let Some(session) = lock(&self.session).take() else { return Ok(()) };
+    fn close(&self, py: Python<'_>) {
+        let Some(session) = lock(&self.session).take() else { return };
         py.detach(|| {
             if let Ok(device) = session.device() {
                 // What was captured until the end still comes. If the device is gone, its records end by themselves.
@@ -413,13 +412,15 @@ impl Device {
             }
             drop(session);
         });
-        Ok(())
     }
 }
 
-/// The boards that are connected: port, serial number, product.
+/// Port, serial number, product.
+type BoardWords = (String, Option<String>, Option<String>);
+
+/// The boards that are connected.
 #[pyfunction]
-pub fn list_boards(py: Python<'_>) -> PyResult<Vec<(String, Option<String>, Option<String>)>> {
+pub fn list_boards(py: Python<'_>) -> PyResult<Vec<BoardWords>> {
     let boards = py.detach(cantap::device::list).map_err(Error::from)?;
     Ok(boards.into_iter().map(|board| (board.port, board.serial_number, board.product)).collect())
 }

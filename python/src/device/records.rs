@@ -91,13 +91,11 @@ impl Records {
                 }
             }
             py.check_signals()?;
-            match until.slice() {
-                Some(next) => slice = next,
-                None => {
-                    self.listener.used_up();
-                    return Ok(Next::Nothing);
-                }
-            }
+            let Some(next) = until.slice() else {
+                self.listener.used_up();
+                return Ok(Next::Nothing);
+            };
+            slice = next;
         }
     }
 }

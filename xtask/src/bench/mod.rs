@@ -25,6 +25,8 @@ mod host;
 mod memory;
 #[cfg(feature = "bench")]
 mod monitor;
+#[cfg(feature = "bench")]
+mod protocols;
 #[cfg(all(feature = "bench", unix))]
 mod serve;
 #[cfg(feature = "bench")]
@@ -65,6 +67,8 @@ enum Subject {
     Host,
     /// Frames per second whose load, periods and losses are measured.
     Stats,
+    /// Frames per second that all protocols read together.
+    Protocols,
     /// Redraws of the live view's graph with five million values in the window.
     Graph,
     /// The package for Python, beside python-can, cantools and asammdf.
@@ -131,6 +135,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Clock => clock::run()?,
             Subject::Host => host::run(),
             Subject::Stats => stats::run()?,
+            Subject::Protocols => protocols::run()?,
             Subject::Graph => graph::run()?,
             Subject::Python => crate::python::measure()?,
             Subject::Monitor => monitor::run(args.seconds)?,

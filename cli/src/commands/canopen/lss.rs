@@ -14,10 +14,10 @@ use crate::wrong::wrong;
 /// The command line.
 #[derive(clap::Args)]
 pub(super) struct LssArgs {
-    /// The node's address in hexadecimal, where it is known: vendor, product, revision, serial number, as 29C:1:10002:4D2. Without it, one
-    /// that has no number is looked for.
+    /// The node's identity (object 1018) in hexadecimal, where it is known: vendor, product, revision, serial number, as
+    /// 29C:1:10002:4D2. Without it, a node that has no number is looked for.
     #[arg(long, value_name = "VENDOR:PRODUCT:REVISION:SERIAL", value_parser = address)]
-    address: Option<LssAddress>,
+    identity: Option<LssAddress>,
     /// Give it this number, 1 to 127.
     #[arg(long, value_name = "NODE", value_parser = clap::value_parser!(u8).range(1..=127))]
     node: Option<u8>,
@@ -50,7 +50,7 @@ pub(super) fn run(speak: &SpeakArgs, args: &LssArgs, timeout_ns: u64) -> anyhow:
     let mut speaking = speak.speak(&device, Box::new(CanOpen::new(Vec::new())));
     // Nobody else may listen to the orders.
     order(&mut speaking, LssOrder::SwitchAll(false), timeout_ns)?;
-    let found = match args.address {
+    let found = match args.identity {
         Some(address) => {
             order(&mut speaking, LssOrder::Switch(address), timeout_ns)?;
             address
@@ -109,7 +109,7 @@ fn scan(speaking: &mut Speaking<'_>, timeout_ns: u64) -> anyhow::Result<LssAddre
     speaking.run(&mut scan)?;
     scan.finish().map_err(|error| match error {
         LssError::Nobody => anyhow!(
-            "{error}; {}; a node that has a number does not answer it: give its --address",
+            "{error}; {}; a node that has a number does not answer it: give its --identity",
             speaking.circumstances()
         ),
         error => anyhow!(error),

@@ -1,5 +1,7 @@
 //! Reading and writing objects.
 
+use std::io::Write as _;
+
 use anyhow::{Context, anyhow};
 use cantap::{TraceEvent, TraceRecord};
 use cantap_protocols::active::sdo::{SdoClient, SdoError, SdoIds, SdoJob};
@@ -150,13 +152,24 @@ pub(super) fn read(
     timeout_ns: u64,
     sheets: Vec<Sheet>,
 ) -> anyhow::Result<()> {
+    // Made first: an object that cannot be kept need not be read.
+    let output = args.output.as_ref().map(|path| {
+        let file = std::fs::File::create_new(path);
+        file.with_context(|| format!("cannot write {}; nothing there is overwritten", path.display()))
+    });
+    let output = output.transpose()?;
     let device = speak.open()?;
     let mut speaking = speak.speak(&device, args.place.witness(sheets));
-    let data = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, timeout_ns)?;
+    let read = args.place.transfer(&mut speaking, args.sub, SdoJob::Read, timeout_ns);
+    if let (Err(_), Some(path)) = (&read, &args.output) {
+        // It is empty, and was not there before.
+        let _ = std::fs::remove_file(path);
+    }
+    let data = read?;
     drop(speaking);
     device.stop()?;
-    if let Some(path) = &args.output {
-        std::fs::write(path, data).with_context(|| format!("cannot write {}", path.display()))?;
+    if let Some(mut file) = output {
+        file.write_all(&data).context("cannot write the object")?;
     }
     Ok(())
 }

@@ -36,7 +36,7 @@ pub struct TransferArgs {
     #[arg(long, value_name = "TIME", default_value = "60s", value_parser = args::positive_duration, global = true)]
     patience: Duration,
     /// The least distance of the frames of an answer (STmin): up to 127ms, or 100us to 900us.
-    #[arg(long, value_name = "TIME", default_value = "0ms", value_parser = separation, global = true)]
+    #[arg(long, value_name = "STMIN", default_value = "0ms", value_parser = separation, global = true)]
     separation: u8,
     /// Frames of an answer for one flow control frame; 0 for all.
     #[arg(long, value_name = "N", default_value_t = 0, global = true)]

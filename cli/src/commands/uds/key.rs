@@ -7,6 +7,7 @@ use std::process::{Command, Stdio};
 use anyhow::{Context, bail, ensure};
 
 use super::client::{Client, first};
+use super::hex::{Hex, byte, bytes};
 
 /// How to unlock the ECU; for commands to flatten into theirs.
 #[derive(clap::Args, Clone)]
@@ -21,7 +22,7 @@ pub struct KeyArgs {
 }
 
 fn level(text: &str) -> Result<u8, String> {
-    let level = super::byte(text).ok().filter(|level| level % 2 == 1 && *level < 0x7F);
+    let level = byte(text).ok().filter(|level| level % 2 == 1 && *level < 0x7F);
     level.ok_or_else(|| "levels are odd numbers from 1 to 7D, in hexadecimal".to_owned())
 }
 
@@ -58,8 +59,8 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
     let output = child.wait_with_output().context("cannot read from --key-command")?;
     ensure!(output.status.success(), "--key-command '{command}' failed: {}; no key was sent", output.status);
     let text = String::from_utf8_lossy(&output.stdout);
-    match super::bytes(text.trim()) {
-        Ok(super::Hex(key)) => Ok(key),
+    match bytes(text.trim()) {
+        Ok(Hex(key)) => Ok(key),
         Err(_) => {
             bail!(
                 "--key-command '{command}' printed '{}', which is no key in hexadecimal; no key was sent",

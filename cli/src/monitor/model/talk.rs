@@ -3,7 +3,7 @@
 use std::collections::VecDeque;
 
 use cantap::TraceRecord;
-use cantap_protocols::{Options, Overview, UnderWay};
+use cantap_protocols::{Event, Options, Overview, UnderWay};
 
 use crate::protocols::Reading;
 
@@ -15,8 +15,8 @@ const RECENT: usize = 500;
 pub struct Talked {
     /// Nodes, services and objects.
     pub overview: Overview,
-    /// The last events: time, channel, whether something went wrong, and what was said; the newest last.
-    pub recent: VecDeque<(i64, u8, bool, String)>,
+    /// The last events; the newest last.
+    pub recent: VecDeque<Event>,
     /// Transfers that have begun and have not ended.
     pub under_way: Vec<UnderWay>,
     /// Events so far, and those in which something went wrong.
@@ -46,7 +46,7 @@ impl Talk {
             if talked.recent.len() == RECENT {
                 talked.recent.pop_front();
             }
-            talked.recent.push_back((event.time_ns, event.channel, event.is_fault(), event.to_string()));
+            talked.recent.push_back(event);
             Ok::<_, std::convert::Infallible>(())
         });
         talked.under_way = self.reading.under_way();

@@ -42,10 +42,10 @@ pub fn draw(frame: &mut Frame<'_>, area: Rect, app: &mut App, model: &Model, see
     // The newest is in sight as long as nothing was scrolled.
     let said = rows.saturating_sub(lines.len() + 1).max(LEAST_SAID).min(talked.recent.len());
     let mut tail = vec![heading("Said last".to_owned())];
-    for (time_ns, channel, is_fault, text) in talked.recent.iter().skip(talked.recent.len() - said) {
-        let since_ns = model.first_ns.map_or(0, |first_ns| time_ns.saturating_sub(first_ns));
-        let line = format!("{:>10.3} {channel} {text}", since_ns as f64 / 1e9);
-        tail.push(if *is_fault { Line::styled(line, app.theme.error()) } else { Line::from(line) });
+    for event in talked.recent.iter().skip(talked.recent.len() - said) {
+        let since_ns = model.first_ns.map_or(0, |first_ns| event.time_ns.saturating_sub(first_ns));
+        let line = format!("{:>10.3} {} {event}", since_ns as f64 / 1e9, event.channel);
+        tail.push(if event.is_fault() { Line::styled(line, app.theme.error()) } else { Line::from(line) });
     }
     lines.extend(tail);
     let most = lines.len().saturating_sub(rows);

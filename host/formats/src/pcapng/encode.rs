@@ -16,6 +16,9 @@ use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 use cantap_trace::{Direction, FdFrame, TraceEvent, TraceFrame, TraceRecord};
 use cantap_wire::record::LossStage;
 
+/// Length of the statistics of one interface: number, time, three counts, the end of the options.
+const STATISTICS_BYTES: usize = BLOCK_FRAME_BYTES + 12 + 3 * 12 + 4;
+
 /// Times are in nanoseconds: 10 to the power of minus this.
 const RESOLUTION: u8 = 9;
 
@@ -273,6 +276,10 @@ impl Encode for Encoder {
         if self.counted.is_none_or(|counted| counted.elapsed() >= every) {
             self.statistics(now_ns(), out);
         }
+    }
+
+    fn held_back(&self) -> usize {
+        self.interfaces.len() * STATISTICS_BYTES
     }
 
     fn remark(&mut self, channel: u8, text: &str) {

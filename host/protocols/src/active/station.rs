@@ -3,6 +3,7 @@
 //! The address is defended as long as the station works. A message of many frames is taken and sent by RTS/CTS, and to all by BAM.
 
 mod long_message;
+mod words;
 
 use std::collections::VecDeque;
 
@@ -10,25 +11,21 @@ use cantap_trace::Id;
 use cantap_wire::Frame;
 
 use self::long_message::{Incoming, Outgoing};
+pub use self::words::StationError;
+use self::words::{CONTROL, DATA, GLOBAL, MS, frame, three};
 use super::{Machine, earlier};
 use crate::j1939::Header;
 
-const MS: u64 = 1_000_000;
 /// Nobody may object to a claim any more after this time (J1939-81).
 const CLAIM_NS: u64 = 250 * MS;
 /// So long an answer is waited for: Tr is 200 ms, and T3 1250 ms.
 const ANSWER_NS: u64 = 1250 * MS;
 /// A message to all that has begun in time takes no longer: 255 frames, 50 ms each.
 const LONGEST_NS: u64 = 15_000 * MS;
-const GLOBAL: u8 = 255;
 const NULL: u8 = 254;
 const REQUEST: u32 = 0xEA00;
 const ACKNOWLEDGE: u32 = 0xE800;
 const CLAIM: u32 = 0xEE00;
-const CONTROL: u32 = 0xEC00;
-const DATA: u32 = 0xEB00;
-/// The longest message (J1939-21).
-const MOST_BYTES: usize = 1785;
 /// Addresses that anybody may take (J1939-81).
 const FREE: std::ops::RangeInclusive<u8> = 128..=247;
 /// The NAME's bit that says so.
@@ -68,88 +65,6 @@ pub struct GroupAnswer {
     pub data: Vec<u8>,
 }
 
-/// Why a station failed.
-#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[non_exhaustive]
-pub enum StationError {
-    /// Another node has the address, and a NAME that goes first.
-    #[error(
-        "the address {address} is taken by the node with the NAME {name:016X}, and there is none left to take"
-    )]
-    AddressTaken {
-        /// The address that was tried last.
-        address: u8,
-        /// The NAME of who has it.
-        name: u64,
-    },
-    /// Nobody answered the request.
-    #[error("no answer within {after_ms} ms")]
-    NoAnswer {
-        /// How long was waited.
-        after_ms: u64,
-    },
-    /// The request was answered that there will be none.
-    #[error("node {from} answers: {}", acknowledgement(*control))]
-    NotAcknowledged {
-        /// Who.
-        from: u8,
-        /// Why, from 1.
-        control: u8,
-    },
-    /// The other side ended a message of many frames.
-    #[error("node {from} aborted the message: {}", abort_reason(*reason))]
-    Aborted {
-        /// Who.
-        from: u8,
-        /// Why.
-        reason: u8,
-    },
-    /// The other side of a message of many frames went silent.
-    #[error("nothing came from node {from} for {after_ms} ms, after {done} of {total} frames of the message")]
-    Silent {
-        /// Who.
-        from: u8,
-        /// How long was waited.
-        after_ms: u64,
-        /// Frames so far.
-        done: u8,
-        /// Frames of the message.
-        total: u8,
-    },
-    /// The other side of a message of many frames asks for what there is not, or again and again for the same.
-    #[error("node {from} does not get on with the message: it has asked for frames again {times} times")]
-    Endless {
-        /// Who.
-        from: u8,
-        /// How often.
-        times: u32,
-    },
-}
-
-const fn acknowledgement(control: u8) -> &'static str {
-    match control {
-        1 => "negative: it does not have the group",
-        2 => "access denied",
-        3 => "busy: it cannot answer now",
-        _ => "a reserved reason",
-    }
-}
-
-const fn abort_reason(reason: u8) -> &'static str {
-    match reason {
-        1 => "it has another connection already",
-        2 => "it lacks the resources",
-        3 => "it has timed out",
-        4 => "clear to send came while data was sent",
-        5 => "too many frames were asked for again",
-        6 => "an unexpected frame",
-        7 => "a frame with a wrong number",
-        8 => "a frame came twice",
-        9 => "the message is too long for it",
-        _ => "a reserved reason",
-    }
-}
-
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Phase {
     New,
@@ -185,20 +100,6 @@ pub struct Station {
     outgoing: Option<Outgoing>,
     answers: Vec<GroupAnswer>,
     end: Option<Result<(), StationError>>,
-}
-
-/// A message's frame.
-fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &[u8]) -> Frame {
-    let mut bytes = [0xFF; 8];
-    let length = data.len().min(8);
-    bytes[..length].copy_from_slice(&data[..length]);
-    Frame::from_bus(Header { priority, pgn, source, destination }.id(), false, length as u8, bytes)
-}
-
-/// A group's number as requests have it.
-fn three(pgn: u32) -> [u8; 3] {
-    let [low, middle, high, _] = pgn.to_le_bytes();
-    [low, middle, high]
 }
 
 impl Station {

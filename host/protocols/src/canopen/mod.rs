@@ -57,12 +57,38 @@ struct Node {
     period_ns: Option<i64>,
     is_period_set: bool,
     is_missing: bool,
+    /// How long others wait for its heartbeat, as somebody was told by object 1016; the shortest.
+    consumer_ns: Option<i64>,
+    /// Objects 100C and 100D, as they were set: milliseconds and how many of them.
+    life: (i64, i64),
+    /// When it was last guarded, until that has stopped for longer than its life time.
+    guarded_ns: Option<i64>,
     /// A guard that waits for its answer.
     guard_ns: Option<i64>,
     toggle: Option<bool>,
     sdo: Sdo,
     pdos: Pdos,
     frames_lost: bool,
+}
+
+impl Node {
+    /// Takes what an SDO transfer that was written says of timeouts; of another node's, who it is and how long in nanoseconds.
+    fn learn_timeouts(&mut self, transfer: &SdoTransfer) -> Option<(u8, i64)> {
+        if transfer.trouble.is_some() || !transfer.is_write {
+            return None;
+        }
+        let value = i64::from(number_of(&transfer.data));
+        match (transfer.index, transfer.sub) {
+            (0x100C, 0) => self.life.0 = value & 0xFFFF,
+            (0x100D, 0) => self.life.1 = value & 0xFF,
+            (0x1016, 1..) => {
+                let (node, ms) = ((value >> 16 & 0xFF) as u8, value & 0xFFFF);
+                return ((1..128).contains(&node) && ms > 0).then_some((node, ms * 1_000_000));
+            }
+            _ => {}
+        }
+        None
+    }
 }
 
 #[derive(Default)]
@@ -140,25 +166,30 @@ impl CanOpen {
             _ if node == 0 => {}
             0x581..=0x5FF | 0x601..=0x67F => {
                 let from_client = id > 0x600;
-                let entry = bus.nodes.entry(node).or_default();
                 let sheet = Self::sheet(sheets, node);
-                for transfer in entry.sdo.take(record.time_ns, from_client, data).into_iter().flatten() {
+                let ended = bus.nodes.entry(node).or_default().sdo.take(record.time_ns, from_client, data);
+                for transfer in ended.into_iter().flatten() {
+                    let entry = bus.nodes.entry(node).or_default();
                     let changed = transfer.trouble.is_none() && entry.pdos.learn(node, &transfer);
                     if transfer.trouble.is_none()
                         && transfer.is_write
                         && (transfer.index, transfer.sub) == (0x1017, 0)
                     {
-                        let ms =
-                            transfer.data.iter().rev().fold(0_i64, |ms, byte| ms << 8 | i64::from(*byte));
+                        let ms = i64::from(number_of(&transfer.data) & 0xFFFF);
                         entry.period_ns = Some(ms * 1_000_000).filter(|ns| *ns > 0);
                         entry.is_period_set = true;
                         entry.beat_ns = None;
                     }
+                    let watched = entry.learn_timeouts(&transfer);
                     let lost = transfer.trouble.is_some() && std::mem::take(&mut entry.frames_lost);
                     let mut event = transfer_event(record, node, transfer, sheet);
                     event.frames_lost |= lost;
                     events.push(event);
-                    if changed {
+                    if let Some((watched, ns)) = watched {
+                        let entry = bus.nodes.entry(watched).or_default();
+                        entry.consumer_ns = Some(entry.consumer_ns.map_or(ns, |known| known.min(ns)));
+                    }
+                    if changed && let Some(entry) = bus.nodes.get(&node) {
                         bus.pdo_ids.retain(|_, (of, _)| *of != node);
                         bus.pdo_ids.extend(entry.pdos.ids().map(|(id, number)| (id, (node, number))));
                     }
@@ -198,7 +229,7 @@ impl CanOpen {
                 if let (Some(beat_ns), Some(period_ns)) = (node.beat_ns, node.period_ns)
                     && !node.is_missing
                 {
-                    let patience = (period_ns as f64 * MISSED_PERIODS) as i64;
+                    let patience = node.consumer_ns.unwrap_or((period_ns as f64 * MISSED_PERIODS) as i64);
                     if now_ns.saturating_sub(beat_ns) > patience {
                         node.is_missing = true;
                         let mut event = event(
@@ -229,6 +260,19 @@ impl CanOpen {
                     event.trouble = Some(Trouble::Timeout { after_ms: (GUARD_NS / 1_000_000) as u32 });
                     events.push(event);
                 }
+                let life_ns = node.life.0.saturating_mul(node.life.1).saturating_mul(1_000_000);
+                if let Some(guarded_ns) = node.guarded_ns
+                    && life_ns > 0
+                    && now_ns.saturating_sub(guarded_ns) > life_ns
+                {
+                    node.guarded_ns = None;
+                    let title = "guarding has stopped for longer than the life time";
+                    let mut event =
+                        event(guarded_ns + life_ns, guarded_ns, number, "guarding_stopped", title);
+                    event.trouble = Some(Trouble::Timeout { after_ms: (life_ns / 1_000_000) as u32 });
+                    event.frames = 0;
+                    events.push(event);
+                }
                 let waits = node.sdo.open.as_ref().map(|open| open.time_ns);
                 if waits.is_some_and(|since| now_ns.saturating_sub(since) > sdo::TIMEOUT_NS) {
                     let trouble = Trouble::Timeout { after_ms: (sdo::TIMEOUT_NS / 1_000_000) as u32 };
@@ -242,6 +286,11 @@ impl CanOpen {
         }
         events[from..].sort_by_key(|event| (event.time_ns, event.channel, event.from.node()));
     }
+}
+
+/// The number in at most four bytes, the lowest first.
+fn number_of(bytes: &[u8]) -> u32 {
+    bytes.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }
 
 /// A record of no frame, for events that no frame makes.
@@ -289,6 +338,7 @@ fn sync(bus: &mut Bus, record: &TraceRecord, data: &[u8], events: &mut Vec<Event
 
 fn guard(bus: &mut Bus, record: &TraceRecord, node: u8, events: &mut Vec<Event>) {
     let entry = bus.nodes.entry(node).or_default();
+    entry.guarded_ns = Some(record.time_ns);
     if let Some(guard_ns) = entry.guard_ns.replace(record.time_ns) {
         let mut event = event(record, "guard_missing", "no answer to guarding");
         event.start_ns = guard_ns;

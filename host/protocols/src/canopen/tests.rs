@@ -233,3 +233,33 @@ fn any_frames_are_taken() {
     }
     assembler.finish(&mut events);
 }
+
+/// How long others wait is what they were told; a node whose life time has passed is no longer guarded.
+#[test]
+fn timeouts_are_those_that_were_set() {
+    let told = said(&[
+        (0.0, "601#23161001C8000500"),
+        (1.0, "581#6016100100000000"),
+        (10.0, "705#05"),
+        (110.0, "705#05"),
+        (400.0, "080#"),
+    ]);
+    let missing = told.iter().find(|line| line.contains("heartbeat missing")).unwrap();
+    assert!(missing.ends_with("nothing came for 200 ms"), "{told:?}");
+    let guarded = said(&[
+        (0.0, "605#2B0C100064000000"),
+        (1.0, "585#600C100000000000"),
+        (2.0, "605#2F0D100003000000"),
+        (3.0, "585#600D100000000000"),
+        (10.0, "705#R1"),
+        (11.0, "705#05"),
+        (110.0, "705#R1"),
+        (111.0, "705#85"),
+        (300.0, "080#"),
+        (500.0, "080#"),
+        (900.0, "080#"),
+    ]);
+    let stopped: Vec<_> = guarded.iter().filter(|line| line.contains("guarding has stopped")).collect();
+    assert_eq!(stopped.len(), 1, "{guarded:?}");
+    assert!(stopped[0].ends_with("nothing came for 300 ms"), "{guarded:?}");
+}

@@ -111,7 +111,7 @@ impl Finder {
                             && candidate.from.id != id
                             && candidate.from.id.is_extended() == id.is_extended()
                             && candidate.from.address.is_some() == from.address.is_some()
-                            && time_ns - candidate.time_ns <= FLOW_TIMEOUT_NS
+                            && time_ns.saturating_sub(candidate.time_ns) <= FLOW_TIMEOUT_NS
                         {
                             candidate.flow = Some((from, block_size, separation_us));
                         }

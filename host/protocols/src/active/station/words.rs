@@ -1,0 +1,108 @@
+//! What a station and its long messages share.
+
+use cantap_wire::Frame;
+
+use crate::j1939::Header;
+
+pub(super) const MS: u64 = 1_000_000;
+pub(super) const GLOBAL: u8 = 255;
+pub(super) const CONTROL: u32 = 0xEC00;
+pub(super) const DATA: u32 = 0xEB00;
+/// The longest message (J1939-21).
+pub(super) const MOST_BYTES: usize = 1785;
+
+/// Why a station failed.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[non_exhaustive]
+pub enum StationError {
+    /// Another node has the address, and a NAME that goes first.
+    #[error(
+        "the address {address} is taken by the node with the NAME {name:016X}, and there is none left to take"
+    )]
+    AddressTaken {
+        /// The address that was tried last.
+        address: u8,
+        /// The NAME of who has it.
+        name: u64,
+    },
+    /// Nobody answered the request.
+    #[error("no answer within {after_ms} ms")]
+    NoAnswer {
+        /// How long was waited.
+        after_ms: u64,
+    },
+    /// The request was answered that there will be none.
+    #[error("node {from} answers: {}", acknowledgement(*control))]
+    NotAcknowledged {
+        /// Who.
+        from: u8,
+        /// Why, from 1.
+        control: u8,
+    },
+    /// The other side ended a message of many frames.
+    #[error("node {from} aborted the message: {}", abort_reason(*reason))]
+    Aborted {
+        /// Who.
+        from: u8,
+        /// Why.
+        reason: u8,
+    },
+    /// The other side of a message of many frames went silent.
+    #[error("nothing came from node {from} for {after_ms} ms, after {done} of {total} frames of the message")]
+    Silent {
+        /// Who.
+        from: u8,
+        /// How long was waited.
+        after_ms: u64,
+        /// Frames so far.
+        done: u8,
+        /// Frames of the message.
+        total: u8,
+    },
+    /// The other side of a message of many frames asks for what there is not, or again and again for the same.
+    #[error("node {from} does not get on with the message: it has asked for frames again {times} times")]
+    Endless {
+        /// Who.
+        from: u8,
+        /// How often.
+        times: u32,
+    },
+}
+
+const fn acknowledgement(control: u8) -> &'static str {
+    match control {
+        1 => "negative: it does not have the group",
+        2 => "access denied",
+        3 => "busy: it cannot answer now",
+        _ => "a reserved reason",
+    }
+}
+
+const fn abort_reason(reason: u8) -> &'static str {
+    match reason {
+        1 => "it has another connection already",
+        2 => "it lacks the resources",
+        3 => "it has timed out",
+        4 => "clear to send came while data was sent",
+        5 => "too many frames were asked for again",
+        6 => "an unexpected frame",
+        7 => "a frame with a wrong number",
+        8 => "a frame came twice",
+        9 => "the message is too long for it",
+        _ => "a reserved reason",
+    }
+}
+
+/// A message's frame.
+pub(super) fn frame(priority: u8, pgn: u32, source: u8, destination: u8, data: &[u8]) -> Frame {
+    let mut bytes = [0xFF; 8];
+    let length = data.len().min(8);
+    bytes[..length].copy_from_slice(&data[..length]);
+    Frame::from_bus(Header { priority, pgn, source, destination }.id(), false, length as u8, bytes)
+}
+
+/// A group's number as requests have it.
+pub(super) fn three(pgn: u32) -> [u8; 3] {
+    let [low, middle, high, _] = pgn.to_le_bytes();
+    [low, middle, high]
+}

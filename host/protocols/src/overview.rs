@@ -364,7 +364,9 @@ mod tests {
         }
         conversations.finish(&mut events);
         let mut overview = Overview::default();
-        events.iter().for_each(|event| overview.take(event));
+        for event in &events {
+            overview.take(event);
+        }
         overview
     }
 

@@ -118,7 +118,9 @@ mod tests {
 
     fn found(frames: &[&str]) -> Vec<Relative> {
         let mut relatives = Relatives::default();
-        frames.iter().for_each(|frame| relatives.take(&frame.parse().unwrap()));
+        for frame in frames {
+            relatives.take(&frame.parse().unwrap());
+        }
         relatives.found()
     }
 

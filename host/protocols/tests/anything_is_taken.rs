@@ -71,7 +71,9 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
         }
         let _ = (conversations.under_way(), survey.found());
         conversations.finish(&mut events);
-        events.iter().for_each(|event| overview.take(event));
+        for event in &events {
+            overview.take(event);
+        }
         assert!(overview.nodes().count() > 0 || protocols.len() == 1, "{protocols:?}");
     }
 }

@@ -282,7 +282,7 @@ fn subject(event: &Event) -> Option<Party> {
     match event.protocol {
         // A request that nobody answers says nothing about a node, and one to all nothing about any.
         Protocol::J1939 | Protocol::Nmea2000 if event.kind == "no_response" => known(event.to),
-        Protocol::J1939 | Protocol::Nmea2000 => known(event.from),
+        Protocol::J1939 | Protocol::Nmea2000 | Protocol::IsoTp => known(event.from),
         Protocol::Uds | Protocol::Kwp2000 | Protocol::Obd => match event.kind {
             "response" => known(event.from),
             "exchange" | "refusal" => known(event.to),
@@ -292,7 +292,6 @@ fn subject(event: &Event) -> Option<Party> {
         Protocol::DeviceNet if matches!(event.kind, "exchange" | "refusal" | "no_response") => {
             known(event.to)
         }
-        Protocol::IsoTp => known(event.from),
         _ => event.node().map(Party::Node),
     }
 }
@@ -341,14 +340,12 @@ fn object(event: &Event) -> Option<(String, Option<String>, Option<String>)> {
             "request" | "no_response" | "acknowledgement" => return None,
             _ => (format!("pgn {}", field("pgn")?.value), Some(event.title.to_string()), None),
         },
-        Protocol::DeviceNet => match event.kind {
-            "io" => (event.title.to_string(), None, None),
-            _ => {
-                let class = format!("class {} instance {}", field("class")?.value, field("instance")?.value);
-                let attribute = field("attribute").map(|field| format!(" attribute {}", field.value));
-                (class + attribute.as_deref().unwrap_or_default(), meaning("class"), value())
-            }
-        },
+        Protocol::DeviceNet if event.kind == "io" => (event.title.to_string(), None, None),
+        Protocol::DeviceNet => {
+            let class = format!("class {} instance {}", field("class")?.value, field("instance")?.value);
+            let attribute = field("attribute").map(|field| format!(" attribute {}", field.value));
+            (class + attribute.as_deref().unwrap_or_default(), meaning("class"), value())
+        }
         Protocol::IsoTp => return None,
     })
 }

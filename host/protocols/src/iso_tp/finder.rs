@@ -28,14 +28,8 @@ struct Candidate {
 }
 
 /// Marks of the candidates' senders: an identifier without its mark is no candidate's.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Copy, Debug, Default)]
 struct Marks([u64; 16]);
-
-impl Default for Marks {
-    fn default() -> Self {
-        Self([0; 16])
-    }
-}
 
 impl Marks {
     /// Word and bit. Neighbouring identifiers, as most buses have, fall on different marks.

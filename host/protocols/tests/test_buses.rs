@@ -177,7 +177,9 @@ fn check(name: &str, bus: &Bus) {
         })
         .collect();
     let mut survey = Survey::new();
-    records.iter().for_each(|record| survey.take(record));
+    for record in &records {
+        survey.take(record);
+    }
     let found = survey.found();
     let mut text = String::new();
     for evidence in &found {
@@ -185,7 +187,9 @@ fn check(name: &str, bus: &Bus) {
     }
     let mut conversations = Conversations::new(&Options { spoken: Some(found), ..Options::default() });
     let (mut events, mut overview) = (Vec::new(), Overview::default());
-    records.iter().for_each(|record| conversations.take(record, &mut events));
+    for record in &records {
+        conversations.take(record, &mut events);
+    }
     conversations.finish(&mut events);
     for event in &events {
         overview.take(event);

@@ -6,7 +6,7 @@ use cantap::TraceRecord;
 use cantap_protocols::{Histogram, KnownNode, Overview, Protocol};
 use serde_json::{Value, json};
 
-use super::Reading;
+use super::reading::Reading;
 
 /// Responses, nodes and objects of a trace, found by reading it.
 pub struct Known {

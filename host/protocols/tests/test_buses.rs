@@ -162,11 +162,10 @@ fn boat() -> Bus {
 }
 
 fn check(name: &str, bus: &Bus) {
-    let log: String = bus
-        .frames
-        .iter()
-        .map(|(us, frame)| format!("({}.{:06}) can0 {frame}\n", us / 1_000_000, us % 1_000_000))
-        .collect();
+    let mut log = String::new();
+    for (us, frame) in &bus.frames {
+        writeln!(log, "({}.{:06}) can0 {frame}", us / 1_000_000, us % 1_000_000).unwrap();
+    }
     let records: Vec<_> = bus
         .frames
         .iter()

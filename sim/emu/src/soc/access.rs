@@ -3,10 +3,11 @@
 
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
+use super::board::{Awaited, Board, PORTS, TIMERS, power, syscfg};
+use super::flash;
 use super::odd::Oddity;
 use super::rcc::Rcc;
 use super::small::{self, Adc};
-use super::{Awaited, Board, PORTS, TIMERS, flash, power, syscfg};
 use crate::cpu::Bus;
 use crate::memory_map as map;
 use crate::timing::Speeds;

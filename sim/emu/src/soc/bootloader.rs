@@ -34,7 +34,7 @@ impl Board {
     /// Does what the bootloader did, as it did it: by writing registers. Returns how long it took at least.
     fn run_bootloader(&mut self) -> u64 {
         self.boot_mode = SYSTEM_MEMORY;
-        self.syscfg = super::syscfg(SYSTEM_MEMORY);
+        self.syscfg = super::board::syscfg(SYSTEM_MEMORY);
         let mhz = (self.crystal.hz / 1_000_000) as u32;
         let mut now = 0;
         // 1 MHz × 240 / 4 = 60 MHz, / 5 = 48 MHz.

@@ -1,0 +1,89 @@
+//! Records read as their bus speaks.
+
+use std::sync::Arc;
+
+use cantap::TraceRecord;
+use cantap_protocols::{Conversations, Event, Options, UnderWay};
+use cantap_signals::Decoder;
+
+use super::surveyed::{self, Surveyed};
+
+/// Reads records by the protocols that were asked for, or by those that the first records of each channel show.
+pub struct Reading {
+    options: Options,
+    surveyed: Surveyed,
+    conversations: Option<Conversations>,
+    events: Vec<Event>,
+    quiet: bool,
+}
+
+impl Reading {
+    /// What is spoken goes to standard error, unless `quiet`.
+    pub fn new(options: Options, decoder: Option<Arc<Decoder>>, quiet: bool) -> Self {
+        let surveyed = Surveyed::new(options.protocols.is_empty());
+        let options = Options { decoder, ..options };
+        Self { options, surveyed, conversations: None, events: Vec::new(), quiet }
+    }
+
+    /// The transfers that have begun and have not ended.
+    pub fn under_way(&self) -> Vec<UnderWay> {
+        self.conversations.as_ref().map_or_else(Vec::new, Conversations::under_way)
+    }
+
+    /// Takes records, and hands out what was said. Until it is clear what is spoken, records wait. Without `more`, this was the end.
+    pub fn take<E>(
+        &mut self,
+        records: &[TraceRecord],
+        more: bool,
+        mut said: impl FnMut(Event) -> Result<(), E>,
+    ) -> Result<(), E> {
+        self.take_both(records, more, |read| match read {
+            Read::Record(_) => Ok(()),
+            Read::Event(event) => said(event),
+        })
+    }
+
+    /// The same, with the records in between: each before what it completes.
+    pub fn take_both<E>(
+        &mut self,
+        records: &[TraceRecord],
+        more: bool,
+        mut read: impl FnMut(Read<'_>) -> Result<(), E>,
+    ) -> Result<(), E> {
+        let Self { options, surveyed, conversations, events, quiet } = self;
+        let waited;
+        let mut records = records;
+        if conversations.is_none() {
+            if !surveyed.take(records, more) {
+                return Ok(());
+            }
+            let found = surveyed.found();
+            if !*quiet {
+                surveyed::tell(found.as_deref(), &surveyed.relatives());
+            }
+            options.spoken = found;
+            waited = surveyed.release();
+            records = &waited;
+        }
+        let conversations = conversations.get_or_insert_with(|| Conversations::new(options));
+        for record in records {
+            read(Read::Record(record))?;
+            conversations.take(record, events);
+            // One by one: what is freed at once is there for the next.
+            events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
+        }
+        if !more {
+            conversations.finish(events);
+            events.drain(..).try_for_each(|event| read(Read::Event(event)))?;
+        }
+        Ok(())
+    }
+}
+
+/// A record, or what was said.
+pub enum Read<'a> {
+    /// The record.
+    Record(&'a TraceRecord),
+    /// What was said.
+    Event(Event),
+}

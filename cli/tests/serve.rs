@@ -384,7 +384,13 @@ fn cut_connections_are_gaps_and_the_capture_goes_on() {
     let server = Server::start(&format!("-d virtual:load=40 -b 500k --unix {path} --tcp 0"), 2);
     let cable = Cable::new(server.at[1].strip_prefix("tcp://").unwrap());
     let (near, far) = (folder.path().join("near.log"), folder.path().join("far.log"));
-    let beside = capture(&server.at[0], &near, "-t 5s").spawn().unwrap();
+    let beside = capture(&server.at[0], &near, "-t 8s").spawn().unwrap();
+    // It begins before the other and ends after it, however busy the computer is.
+    let started = Instant::now();
+    while std::fs::metadata(&near).map_or(0, |file| file.len()) < 1000 {
+        assert!(started.elapsed() < Duration::from_secs(10), "nothing is captured");
+        std::thread::sleep(Duration::from_millis(20));
+    }
     let cut = capture(&format!("tcp://127.0.0.1:{}", cable.port), &far, "-t 4s").spawn().unwrap();
     for _ in 0..2 {
         std::thread::sleep(Duration::from_millis(1300));

@@ -369,13 +369,10 @@ fn tshark_captures_two_saturated_channels_and_nothing_is_dropped_in_between() {
         let times = times(&all, channel);
         let span_ns = times[times.len() - 1] - times[0];
         assert!(times.len() > 30_000, "{}", times.len());
-        // The device's clock against this computer's is measured on the way: up to a tenth of a frame in two seconds is its doing.
+        // The device's clock against this computer's is measured on the way, the worse the busier this computer is.
         let frames = span_ns as f64 / 48_000.0;
-        assert!(
-            (frames - (times.len() - 1) as f64).abs() < 4.0,
-            "channel {channel}: {frames} of {}",
-            times.len()
-        );
+        let off = frames / (times.len() - 1) as f64 - 1.0;
+        assert!(off.abs() < 0.001, "channel {channel}: {frames} of {}", times.len());
         assert!(times.windows(2).all(|pair| pair[1] - pair[0] < 90_000), "channel {channel}");
     }
     assert!(!all.iter().any(is_loss));

@@ -108,6 +108,9 @@ impl TraceWriter for Rotating {
         if self.full(record, since_ns) && self.current.has_records() {
             self.next_file()?;
             self.since_ns = Some(record.time_ns);
+            self.current.write(record)?;
+            // A file without even its head is no trace, should the program be killed now.
+            return self.current.flush();
         }
         self.current.write(record)
     }

@@ -90,10 +90,12 @@ pub fn round_trips(device: &Device) -> Result {
 /// How much faster the device's clock runs than this computer's.
 pub fn clock(device: &Device) -> Outcome {
     let started = Instant::now();
-    while device.clock().drift_ppm.is_none() && started.elapsed() < CLOCK_PATIENCE {
+    let drift = || device.clock().drift_ppm;
+    // A first figure from while this computer was busy does not last; that of a bad clock does.
+    while drift().is_none_or(|ppm| ppm.abs() > MAX_DRIFT_PPM) && started.elapsed() < CLOCK_PATIENCE {
         std::thread::sleep(Duration::from_millis(100));
     }
-    let Some(ppm) = device.clock().drift_ppm.map(|ppm| rounded(ppm, 2)) else {
+    let Some(ppm) = drift().map(|ppm| rounded(ppm, 2)) else {
         let why =
             "it could not be measured: the device does not run in real time, or this computer is too busy";
         return Outcome::Skip(why.to_owned());

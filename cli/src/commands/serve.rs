@@ -3,7 +3,7 @@
 #[cfg(feature = "tls")]
 mod keys;
 
-use std::io::{self, ErrorKind, Read, Write};
+use std::io::{self, Read, Write};
 use std::net::{Ipv4Addr, SocketAddr};
 #[cfg(unix)]
 use std::path::Path;
@@ -230,13 +230,18 @@ fn listen(
 ) -> anyhow::Result<Vec<Listening>> {
     let mut ways = Vec::new();
     let mut said = Vec::new();
+    // Where there are no sockets with paths, one on this computer alone takes their place.
+    #[cfg(not(unix))]
+    let loopback = (SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), PORT), Way::Plain);
+    #[cfg(not(unix))]
+    let tcp = tcp.or(Some(&loopback));
     for (number, board) in boards.iter().enumerate() {
         let mut names = Vec::new();
         #[cfg(unix)]
         if tcp.is_none() || args.unix.is_some() {
             let path = numbered(&args.unix.clone().unwrap_or_else(connect::default_socket), number);
             let way = listen::unix(board, &path, args.allow).map_err(|error| match error.kind() {
-                ErrorKind::AddrInUse => anyhow::anyhow!(
+                io::ErrorKind::AddrInUse => anyhow::anyhow!(
                     "another server is at '{}' already; end it, or give another path with --unix",
                     path.display()
                 ),
@@ -248,9 +253,6 @@ fn listen(
             names.push(format!("unix:{}", path.display()));
             ways.push(way);
         }
-        #[cfg(not(unix))]
-        let tcp =
-            tcp.or(Some(&(SocketAddr::new(std::net::IpAddr::V4(Ipv4Addr::LOCALHOST), PORT), Way::Plain)));
         if let Some((first, way)) = tcp {
             let port = match first.port() {
                 0 => 0,

@@ -5,6 +5,7 @@ use std::io::ErrorKind;
 use std::path::PathBuf;
 use std::process::Command;
 
+#[cfg(feature = "tls")]
 use anyhow::Context;
 use cantap::device::Link;
 use cantap_serve::{Role, connect};

@@ -89,8 +89,8 @@ pub struct Machine {
     stalled_until: u64,
     look_in: u32,
     resets: u64,
-    /// A peripheral's clock was just switched on.
-    awaits_clock: bool,
+    /// It matters if the core executes a barrier.
+    awaits_barrier: bool,
     /// Whether the chip has run at all.
     started: bool,
     /// Which exceptions have reached each attached device, by the device's interrupt.
@@ -131,7 +131,7 @@ impl Machine {
             stalled_until: 0,
             look_in: LOOK_EVERY,
             resets: 0,
-            awaits_clock: false,
+            awaits_barrier: false,
             started: false,
             accessors: BTreeMap::new(),
             watched_priority: None,
@@ -286,7 +286,7 @@ impl Machine {
 
     fn step(&mut self) -> Result<(), Stopped> {
         let before = *self.cpu.state();
-        if self.awaits_clock && self.cpu.at_barrier() {
+        if self.awaits_barrier && self.cpu.at_barrier() {
             lock(&self.board).barrier();
         }
         let cycles = self.cpu.step();
@@ -410,7 +410,7 @@ impl Machine {
         let mut board = lock(&self.board);
         self.lines = board.lines() & !self.held_lines;
         self.next_event = board.next_event().unwrap_or(u64::MAX);
-        self.awaits_clock = board.awaits_clock();
+        self.awaits_barrier = board.awaits_barrier();
         self.cpu.show_at_zero(board.memory_at_zero() == rom::SYSTEM_MEMORY);
         let stall = board.take_stall();
         if stall > 0 {

@@ -115,7 +115,10 @@ impl Board {
                 }
                 self.rcc.read(offset)
             }
-            0x4002_3C00 => self.flash.read(offset),
+            0x4002_3C00 => {
+                self.flash.advance(now);
+                self.flash.read(offset)
+            }
             0xE004_2000 => self.dbgmcu.read(offset),
             _ => None,
         }
@@ -123,7 +126,7 @@ impl Board {
 
     pub(super) fn write(&mut self, address: u32, size: u8, value: u32, now: u64) {
         if map::FLASH.contains(&address) {
-            return self.flash.program(address, size, value);
+            return self.flash.store(address, size, value, now);
         }
         if !self.clocked(address, now) {
             return self.note(Oddity::Unclocked, address, true);
@@ -194,7 +197,10 @@ impl Board {
                 }
                 Some(())
             }
-            0x4002_3C00 => self.flash.write(offset, value),
+            0x4002_3C00 => {
+                self.flash.advance(now);
+                self.flash.write(offset, value)
+            }
             0xE004_2000 => self.dbgmcu.write(offset, value),
             _ => None,
         }

@@ -202,14 +202,15 @@ impl Board {
         self.dbgmcu.read(4).unwrap_or(0)
     }
 
-    /// Whether a peripheral's clock was just switched on, so that it matters whether the core executes a barrier.
-    pub fn awaits_clock(&self) -> bool {
-        self.awaited.is_some()
+    /// Whether it matters if the core executes a barrier: a peripheral's clock was just switched on, or a store to flash is on its way.
+    pub fn awaits_barrier(&self) -> bool {
+        self.awaited.is_some() || self.flash.next_event().is_some()
     }
 
     /// The core executed a barrier: what it wrote has arrived.
     pub fn barrier(&mut self) {
         self.awaited = None;
+        self.flash.arrive();
     }
 
     /// Leaves an error in the flash interface that nobody has cleared.
@@ -301,12 +302,14 @@ impl Board {
             .chain(devices)
             .chain(self.can.next_event())
             .chain(self.watchdog.deadline())
+            .chain(self.flash.next_event())
             .min()
     }
 
     /// Lets everything happen that is due at or before `now`.
     pub fn advance(&mut self, now: u64) {
         self.advance_buses(now);
+        self.flash.advance(now);
         for timer in &mut self.timers {
             timer.advance(now);
         }

@@ -23,6 +23,9 @@ pub const PGSERR: u32 = 1 << 7;
 /// Every error: operation, write protection, alignment and those two.
 const ERRORS: u32 = 1 << 1 | 1 << 4 | 1 << 5 | PGPERR | PGSERR;
 const PROGRAM_US: u64 = 16;
+/// Core cycles that a store to flash is on its way, unless the core waits for it at a barrier. The core's buffer and the bus give no bound;
+/// this is more than a program without a barrier takes to look at the status and to lock the interface.
+const STORE_CYCLES: u64 = 48;
 
 /// The sectors: four of 16 KiB, one of 64, seven of 128, with the time their erasure takes in ms.
 fn sector(number: u32) -> Option<(Range<u32>, u64)> {
@@ -67,13 +70,35 @@ pub struct FlashInterface {
     options: u32,
     /// Core cycles for which the core now stands still.
     stall: u64,
+    /// A store that has not arrived: the interface knows nothing of it, and is not busy.
+    under_way: Option<Store>,
+}
+
+/// A store to flash.
+#[derive(Clone, Copy, Debug)]
+struct Store {
+    address: u32,
+    size: u8,
+    value: u32,
+    /// When it arrives.
+    at: u64,
 }
 
 impl FlashInterface {
     /// Locked, as after reset.
     pub fn new(clock: Clock, memory: Memory) -> Self {
         let options = 0x0FFF_AAED;
-        Self { clock, memory, access: 0, keys_given: 0, status: 0, control: LOCK, options, stall: 0 }
+        Self {
+            clock,
+            memory,
+            access: 0,
+            keys_given: 0,
+            status: 0,
+            control: LOCK,
+            options,
+            stall: 0,
+            under_way: None,
+        }
     }
 
     /// The same memory after a reset.
@@ -178,8 +203,33 @@ impl FlashInterface {
         self.status |= EOP;
     }
 
-    /// A store to flash: programs, if that was set up. Bits only go from 1 to 0.
-    pub fn program(&mut self, address: u32, size: u8, value: u32) {
+    /// The core stores to flash. It arrives later; one before it has arrived by then.
+    pub fn store(&mut self, address: u32, size: u8, value: u32, now: u64) {
+        self.arrive();
+        self.under_way = Some(Store { address, size, value, at: now + STORE_CYCLES });
+    }
+
+    /// When a store arrives.
+    pub fn next_event(&self) -> Option<u64> {
+        self.under_way.map(|store| store.at)
+    }
+
+    /// Lets a store arrive whose time has come.
+    pub fn advance(&mut self, now: u64) {
+        if self.next_event().is_some_and(|at| at <= now) {
+            self.arrive();
+        }
+    }
+
+    /// Lets a store arrive: the core waits for it.
+    pub fn arrive(&mut self) {
+        if let Some(Store { address, size, value, .. }) = self.under_way.take() {
+            self.program(address, size, value);
+        }
+    }
+
+    /// A store arrives: programs, if that was set up. Bits only go from 1 to 0.
+    fn program(&mut self, address: u32, size: u8, value: u32) {
         let parallelism = 1 << (self.control >> 8 & 3);
         if self.control & PG == 0 || self.control & LOCK != 0 || self.is_stuck() {
             self.status |= PGSERR;
@@ -236,6 +286,24 @@ mod tests {
         assert_eq!(memory.word(address), Some(u32::MAX));
         assert_eq!(flash.read(0x0C).unwrap(), EOP);
         assert_eq!(flash.take_stall(), CLOCK.us(2 * 16 + 1_000_000));
+    }
+
+    #[test]
+    fn who_does_not_wait_for_a_store_finds_the_interface_idle_and_loses_it_by_locking() {
+        let address = 0x080E_0000;
+        for waits in [true, false] {
+            let (mut flash, memory) = unlocked();
+            flash.write(0x10, PG | 2 << 8).unwrap();
+            flash.store(address, 4, 0, 100);
+            if waits {
+                flash.arrive();
+            }
+            assert_eq!(flash.read(0x0C).unwrap(), if waits { EOP } else { 0 });
+            flash.write(0x10, LOCK).unwrap();
+            flash.advance(100 + STORE_CYCLES);
+            assert_eq!(memory.word(address), Some(if waits { 0 } else { u32::MAX }));
+            assert_eq!(flash.read(0x0C).unwrap() & PGSERR != 0, !waits);
+        }
     }
 
     #[test]

@@ -5,6 +5,7 @@
 #[path = "../../sim/tests/common/mod.rs"]
 mod common;
 
+use std::path::Path;
 use std::sync::PoisonError;
 use std::time::Duration;
 
@@ -35,7 +36,12 @@ impl Found {
 /// Searches on a bus; nothing may be driven on it meanwhile, neither an acknowledgement nor an error flag. With `beside`, the other channel
 /// captures at that bit rate, and must not miss a frame.
 fn search_beside(channel: Channel, options: &str, silence: Duration, beside: Option<u32>) -> Found {
-    let address: Address = format!("{},{options}", common::elf().display()).parse().unwrap();
+    search_of(&common::elf(), channel, options, silence, beside)
+}
+
+/// The same with a board's firmware.
+fn search_of(elf: &Path, channel: Channel, options: &str, silence: Duration, beside: Option<u32>) -> Found {
+    let address: Address = format!("{},{options}", elf.display()).parse().unwrap();
     let port = address.open().unwrap();
     let witness = port.device.witness();
     let link = Link::new(port.reader, port.writer).keeping(port.device);
@@ -63,6 +69,20 @@ fn search_beside(channel: Channel, options: &str, silence: Duration, beside: Opt
 
 fn search_on(channel: Channel, options: &str) -> Found {
     search_beside(channel, options, Duration::from_millis(1200), None)
+}
+
+/// Each board has its receive pins elsewhere, and its firmware says where.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn every_board_hears_both_of_its_buses() {
+    for (name, ..) in common::BOARDS {
+        let elf = common::elf().with_file_name(format!("cantap-{name}.elf"));
+        for channel in Channel::ALL {
+            let options = "bitrate=125k,burst=1/20ms,speed=0.25";
+            let found = search_of(&elf, channel, options, Duration::from_millis(1200), None);
+            assert_eq!(found.bitrate_bps(), Some(125_000), "{name}, {channel:?}: {:?}", found.outcome);
+        }
+    }
 }
 
 /// Every rate of CiA's and the others in common use, each frame twenty milliseconds after the one before. The emulation is

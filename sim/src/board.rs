@@ -1,6 +1,7 @@
 //! What the emulator is to know of our boards and of the firmware: clock, crystal, and the interrupts that capture.
 
-use cantap_emu::{Clock, Setup};
+use cantap_emu::{Clock, Image, Setup};
+use cantap_wire::RECEIVE_PINS_SYMBOL;
 
 /// The firmware's SYSCLK, which is the core's clock.
 pub const CLOCK: Clock = Clock::new(144_000_000);
@@ -12,4 +13,15 @@ pub const CAPTURE_IRQS: [[u16; 2]; 2] = [[20, 21], [64, 11]];
 /// The Olimex STM32-P405, with the masking of the interrupts that stamp measured.
 pub fn setup() -> Setup {
     Setup { watched: 1 << CAPTURE_IRQS[0][0] | 1 << CAPTURE_IRQS[1][0], ..Setup::new(CLOCK, CRYSTAL_HZ) }
+}
+
+/// The same with the buses at the pins that a firmware has them at.
+pub fn setup_for(image: &Image) -> Setup {
+    let pins = image.datum(RECEIVE_PINS_SYMBOL).and_then(|address| image.bytes_at(address));
+    let mut setup = setup();
+    if let Some([port_1, pin_1, port_2, pin_2, ..]) = pins {
+        setup.receive_pins =
+            [(usize::from(*port_1), u32::from(*pin_1)), (usize::from(*port_2), u32::from(*pin_2))];
+    }
+    setup
 }

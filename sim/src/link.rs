@@ -131,7 +131,7 @@ impl Served {
     /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
     /// of `options` from now on, any other and a replayed log as long as the channel is open.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
-        let setup = Setup { joined: manner.joined, bound: options.bound, ..board::setup() };
+        let setup = Setup { joined: manner.joined, bound: options.bound, ..board::setup_for(&image) };
         let mut rig = Rig::new(image, setup, options.timing);
         rig.plug_in()?;
         let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);

@@ -155,7 +155,7 @@ pub struct Report {
 /// Runs `image` and captures from it.
 pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, Trace)>), RigError> {
     let bitrate_bps = options.bitrate_bps.unwrap_or(DEFAULT_BITRATE_BPS);
-    let setup = Setup { bound: options.bound, ..board::setup() };
+    let setup = Setup { bound: options.bound, ..board::setup_for(&image) };
     let mut rig = Rig::new(image, setup, options.timing);
     let hello = rig.connect()?;
     for channel in &options.channels {

@@ -37,6 +37,15 @@ use crate::board::{self, Leds, Ports};
 #[unsafe(no_mangle)]
 static CANTAP_PROTOCOL_VERSION: u16 = cantap_wire::PROTOCOL_VERSION;
 
+/// Where the buses arrive, for those who load the ELF ([`cantap_wire::RECEIVE_PINS_SYMBOL`]).
+// SAFETY: as above.
+#[used]
+#[unsafe(no_mangle)]
+static CANTAP_RECEIVE_PINS: [[u8; 2]; CHANNELS] = {
+    let [one, two] = board::RECEIVE_PINS;
+    [[one.port as u8, one.pin], [two.port as u8, two.pin]]
+};
+
 /// Everything that the tasks need, set up and running; both controllers are off the bus.
 pub struct Hardware {
     /// Both CAN controllers.

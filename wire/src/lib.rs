@@ -26,6 +26,10 @@ pub const PROTOCOL_VERSION: u16 = 5;
 /// firmware, so that a program that loads the ELF can refuse a mismatch before it runs it.
 pub const PROTOCOL_SYMBOL: &str = "CANTAP_PROTOCOL_VERSION";
 
+/// Name of the ELF symbol that says where each channel's RX is: two bytes a channel, the port (0 is A) and the pin, so that a program that
+/// loads the ELF can connect the buses.
+pub const RECEIVE_PINS_SYMBOL: &str = "CANTAP_RECEIVE_PINS";
+
 /// USB vendor and product ID. These are pid.codes' test IDs, for use until a product ID is assigned;
 /// they may not be shipped in a product.
 pub const USB_VID: u16 = 0x1209;

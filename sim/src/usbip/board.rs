@@ -91,7 +91,8 @@ pub struct Board {
 impl Board {
     /// A board with `image`, and the cable out.
     pub fn new(image: Image) -> Self {
-        let mut machine = Machine::new(image, board::setup());
+        let setup = board::setup_for(&image);
+        let mut machine = Machine::new(image, setup);
         let timing = Timing { recovery: Timing::new(CLOCK).recovery, ..Timing::hasty(CLOCK) };
         let port = Arc::new(Mutex::new(UsbPort::with_driver(timing, Urbs::new())));
         machine.attach(map::OTG_FS, map::OTG_FS_IRQ, Arc::clone(&port) as _);

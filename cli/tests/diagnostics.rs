@@ -46,11 +46,11 @@ fn a_car_tells_who_it_is_what_it_has_and_how_it_is() {
 #[test]
 fn codes_are_erased_only_when_that_is_meant() {
     let (code, said) = badly("obd -d virtual:car clear");
-    assert!(code == Some(1) && said.contains("--yes"), "{said}");
+    assert!(code == Some(2) && said.contains("--yes"), "{said}");
     let out = well("obd -d virtual:car clear --yes");
     assert!(out.contains("clear trouble codes"), "{out}");
     let (code, said) = badly("uds -d virtual:car dtc --clear");
-    assert!(code == Some(1) && said.contains("--yes"), "{said}");
+    assert!(code == Some(2) && said.contains("--yes"), "{said}");
     assert!(well("uds -d virtual:car dtc --clear --yes").contains("ClearDiagnosticInformation"));
     assert!(well("uds -d virtual:car dtc").contains("P0128-00"));
 }

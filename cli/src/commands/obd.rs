@@ -13,6 +13,7 @@ use cantap_protocols::iso_tp::{Endpoint, Pair};
 
 use super::uds::{Client, TransferArgs};
 use crate::speaking::SpeakArgs;
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// How long all ECUs have to answer, where it is not known how many there are. ISO 15765-4 has 50 ms.
@@ -79,9 +80,9 @@ struct Server {
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if matches!(args.what, Some(What::Clear { yes: false })) {
-        bail!(
-            "clearing erases what the workshop needs to find the fault, and readiness tests start anew; if that is meant, add --yes"
-        );
+        return Err(wrong(
+            "clearing erases what the workshop needs to find the fault, and readiness tests start anew; if that is meant, add --yes",
+        ));
     }
     let device = args.speak.open()?;
     let speaking = args.speak.speak(&device, Box::new(Diagnostics::new(&[], false)));

@@ -7,7 +7,6 @@ mod key;
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
 use cantap_protocols::Event;
 use cantap_protocols::diagnostics::Diagnostics;
 
@@ -15,6 +14,7 @@ pub use self::client::{Client, TransferArgs};
 use self::hex::{Hex, byte, bytes, number, word};
 use self::key::KeyArgs;
 use crate::speaking::SpeakArgs;
+use crate::wrong::wrong;
 use crate::{args, interrupt};
 
 /// The command line.
@@ -212,7 +212,7 @@ impl Args {
             }
             What::TesterPresent { count, period, .. } => {
                 if period.is_none() && count.is_some_and(|count| count > 1) {
-                    return Err(crate::wrong::wrong("say how often with --period, as --period 2s"));
+                    return Err(wrong("say how often with --period, as --period 2s"));
                 }
                 vec![vec![0x3E, 0]]
             }
@@ -225,14 +225,14 @@ impl Args {
                 vec![vec![0x11, kind]]
             }
             What::Dtc { clear: true, yes: false, .. } => {
-                bail!(
-                    "clearing erases what the workshop needs to find the fault; if that is meant, add --yes"
-                )
+                return Err(wrong(
+                    "clearing erases what the workshop needs to find the fault; if that is meant, add --yes",
+                ));
             }
             What::Dtc { clear: true, .. } => vec![vec![0x14, 0xFF, 0xFF, 0xFF]],
             What::Dtc { mask, .. } => vec![vec![0x19, 0x02, *mask]],
             What::Raw { bytes: texts } => {
-                let Hex(request) = bytes(&texts.concat()).map_err(crate::wrong::wrong)?;
+                let Hex(request) = bytes(&texts.concat()).map_err(wrong)?;
                 vec![request]
             }
         })

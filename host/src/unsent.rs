@@ -205,6 +205,14 @@ impl Seen {
     }
 }
 
+fn take(channels: &mut [Seen; CHANNELS], records: &[TraceRecord]) {
+    for record in records {
+        if let Some(channel) = Channel::from_number(record.channel) {
+            channels[channel.index()].push(record);
+        }
+    }
+}
+
 /// Watches frames being sent.
 pub struct Watch<'d> {
     device: &'d Device,
@@ -235,11 +243,7 @@ impl<'d> Watch<'d> {
 
     /// Takes notice of what was on the bus.
     pub fn take(&mut self, records: &[TraceRecord]) {
-        for record in records {
-            if let Some(channel) = Channel::from_number(record.channel) {
-                self.channels[channel.index()].push(record);
-            }
-        }
+        take(&mut self.channels, records);
     }
 
     /// Takes notice of how transmissions ended.
@@ -303,15 +307,14 @@ impl<'d> Watch<'d> {
     }
 
     fn take_records(&mut self) -> Result<(), DeviceError> {
-        let Some(mut records) = self.records.take() else { return Ok(()) };
+        let Some(records) = &mut self.records else { return Ok(()) };
         while let Some(batch) = records.next_batch(Duration::ZERO)? {
             if batch.is_empty() {
                 break;
             }
-            self.take(&batch);
+            take(&mut self.channels, &batch);
             records.recycle(batch);
         }
-        self.records = Some(records);
         Ok(())
     }
 }

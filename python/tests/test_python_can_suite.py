@@ -10,12 +10,13 @@ import pytest
 
 SOURCE = os.environ.get("CANTAP_PYTHON_CAN_SOURCE")
 
-# Each file, what of it is for any interface, and how many tests that are at least.
+# Each file, what of it is for any interface, and how many tests pass at least. In the first two, python-can leaves out one test
+# that measures time where the variable `CI` says that nobody is watching.
 TESTS = [
     # `unique` opens a third bus, and there are two channels; the second object of a channel does not hear the first one's frames.
-    ("back2back_test.py", "Back2BackTestCase and not unique", 11),
+    ("back2back_test.py", "Back2BackTestCase and not unique", 10),
     # `restart` and `thread_based` are about the class of python-can's threads.
-    ("simplecyclic_test.py", "not restart and not thread_based", 5),
+    ("simplecyclic_test.py", "not restart and not thread_based", 4),
     ("notifier_test.py", "", 5),
     ("test_message_filtering.py", "", 3),
     ("contextmanager_test.py", "", 2),

@@ -44,7 +44,7 @@ impl Controllers {
         CAN1::reset(rcc);
         CAN2::reset(rcc);
         let blocks = [Registers(CAN1::ptr()), Registers(CAN2::ptr())];
-        let mut control = blocks.map(|can| CanControl::new(can));
+        let mut control = blocks.map(CanControl::new);
         // After a reset a controller sleeps.
         control.iter_mut().for_each(Control::stop);
         Self {

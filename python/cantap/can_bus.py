@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import collections
+import logging
 import math
 import threading
 from collections.abc import Callable, Sequence
@@ -18,6 +20,9 @@ from can.broadcastmanager import (
 from . import _native
 from ._native import DeviceError, PeriodicFrame
 from .device import CAPACITY, Device, Mode, boards
+
+LOG = logging.getLogger("can.bus")
+"""python-can's own, which has what is received."""
 
 ALL_ERRORS = "#1FFFFFFF"
 EXTENDED = 0x8000_0000
@@ -114,6 +119,10 @@ class CantapBus(can.BusABC):
             session.users[self._number] = session.users.get(self._number, 0) + 1
             _sessions[self._address] = session
         self._session = session
+        # What came from the device together, as arguments of `can.Message`.
+        self._waiting: collections.deque[
+            tuple[float, int, bool, bool, bool, int, int, bytearray, bool, bool]
+        ] = collections.deque()
         super().__init__(channel=channel, can_filters=can_filters)
 
     def _segments(self, timing: can.BitTiming | None) -> tuple[int, int, int, int] | None:
@@ -145,20 +154,36 @@ class CantapBus(can.BusABC):
 
     # Receiving
 
+    def recv(self, timeout: float | None = None) -> can.Message | None:
+        """As python-can's, which looks at each message again: here filters are done."""
+        message = self._next(timeout)
+        if message is not None and LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
+            LOG.log(self.RECV_LOGGING_LEVEL, "Received: %s", message)
+        return message
+
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        return self._next(timeout), True
+
+    def _next(self, timeout: float | None) -> can.Message | None:
         if self._is_shutdown:
             raise can.CanOperationError(f"{self.channel_info} is shut down")
-        try:
-            found = self._records._message(timeout)
-        except DeviceError as error:
-            raise can.CanOperationError(str(error)) from error
-        if found is None:
-            return None, True
-        timestamp, identifier, extended, remote, is_error, dlc, data, is_rx, _ = found
-        message = can.Message(
-            timestamp, identifier, extended, remote, is_error, self._number - 1, dlc, data, False, is_rx
-        )
-        return message, True
+        waiting = self._waiting
+        while True:
+            try:
+                found = waiting.popleft()
+            except IndexError:
+                try:
+                    more = self._records._messages(timeout)
+                except DeviceError as error:
+                    raise can.CanOperationError(str(error)) from error
+                if not more:
+                    return None
+                # In place: another thread may have got some at the same time.
+                waiting.extend(more)
+                continue
+            if not waiting:
+                self._records._used_up()
+            return can.Message(*found)
 
     def _apply_filters(self, filters: Any) -> None:
         self._records._filter(_filter_texts(filters), not self._own)

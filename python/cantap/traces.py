@@ -202,7 +202,11 @@ def stats(
 def _rates(rates: int | Mapping[int, int] | None) -> list[tuple[int | None, int]]:
     if rates is None:
         return []
-    return [(None, rates)] if isinstance(rates, int) else list(rates.items())
+    if isinstance(rates, int):
+        return [(None, rates)]
+    if isinstance(rates, Mapping):
+        return list(rates.items())
+    raise TypeError(f"a bit rate is a number, or one for each channel in a mapping, not {type(rates).__name__}")
 
 
 def write(

@@ -100,6 +100,12 @@ impl Report {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Says how many frames were decoded, and how many values they had.
+    pub fn set_decoded(&self, (decoded, values): (u64, u64)) {
+        let mut counts = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        (counts.decoded, counts.values) = (decoded, values);
+    }
+
     /// Replaces it.
     pub fn set(&self, counts: Counts) {
         *self.0.lock().unwrap_or_else(PoisonError::into_inner) = counts;

@@ -1,6 +1,6 @@
 //! What is done with a whole trace.
 
-use std::collections::{HashMap, HashSet};
+use std::collections::HashSet;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
@@ -14,7 +14,7 @@ use cantap_columns::{FrameColumns, MessageColumns};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, Message, MessageRef, Selection, SignalValue};
+use cantap_signals::{Decoder, Message, Selection, SignalValue};
 use pyo3::prelude::*;
 
 use crate::database::Database;
@@ -29,14 +29,14 @@ fn walk(
     py: Python<'_>,
     options: &Options,
     report: &Report,
-    mut each: impl FnMut(&cantap::TraceRecord, &mut TraceSource) -> Result<(), Error> + Send,
+    mut each: impl FnMut(&cantap::TraceRecord) -> Result<(), Error> + Send,
 ) -> PyResult<()> {
     let for_source = report.clone();
     let mut source = py.detach(|| TraceSource::open(options, for_source))?;
     let mut records = Vec::new();
     while py.detach(|| -> Result<bool, Error> {
         let more = source.next_batch(&mut records)?;
-        records.iter().try_for_each(|record| each(record, &mut source))?;
+        records.iter().try_for_each(&mut each)?;
         Ok(more)
     })? {
         py.check_signals()?;
@@ -72,7 +72,7 @@ pub fn stats(
     });
     let mut statistics = statistics.map_err(Error::argument)?;
     let report = Report::default();
-    walk(py, &options, &report, |record, _| {
+    walk(py, &options, &report, |record| {
         statistics.push(record);
         Ok(())
     })?;
@@ -90,9 +90,12 @@ struct PerMessage {
     decoder: Arc<Decoder>,
     /// Of chosen signals only: a message without any of them counts for nothing.
     chosen: Option<Selection>,
-    tables: HashMap<MessageRef, MessageColumns>,
+    /// By [`MessageRef::index`](cantap_signals::MessageRef::index).
+    tables: Vec<Option<Box<MessageColumns>>>,
     events: FrameColumns,
     values: Vec<SignalValue>,
+    /// Frames of messages.
+    decoded: u64,
 }
 
 /// What Python's half makes a mapping of: tables by name, and the events.
@@ -101,24 +104,43 @@ type Tables = (Vec<(String, Table)>, Table);
 impl PerMessage {
     fn new(decoder: Arc<Decoder>, signals: &[String]) -> Result<Self, Error> {
         let chosen = if signals.is_empty() { None } else { Some(Selection::new(signals)?) };
-        let events = FrameColumns::default();
-        Ok(Self { decoder, chosen, tables: HashMap::new(), events, values: Vec::new() })
+        let tables = decoder.messages().map(|_| None).collect();
+        Ok(Self { decoder, chosen, tables, events: FrameColumns::default(), values: Vec::new(), decoded: 0 })
     }
 
-    /// Appends a record; returns how many values it has, if it is a frame of a message.
-    fn push(&mut self, record: &cantap::TraceRecord) -> Option<usize> {
-        let Self { decoder, chosen, tables, events, values } = self;
+    /// Appends a record.
+    fn push(&mut self, record: &cantap::TraceRecord) {
+        let Self { decoder, chosen, tables, events, values, decoded } = self;
         let Some(frame) = record.frame() else {
             events.push(record);
-            return None;
+            return;
         };
-        let reference = decoder.decode(record.channel, frame, values)?;
-        if values.is_empty() && chosen.is_some() {
-            return None;
+        if frame.is_remote() {
+            return;
         }
-        let message = decoder.message(reference);
-        tables.entry(reference).or_insert_with(|| MessageColumns::new(message)).push(message, record, values);
-        Some(values.len())
+        let Some(reference) = decoder.find(record.channel, frame.id()) else { return };
+        if chosen.is_some() && !decoder.is_selected(reference) {
+            return;
+        }
+        let table = &mut tables[reference.index()];
+        let table = table.get_or_insert_with(|| Box::new(MessageColumns::new(decoder, reference)));
+        if chosen.is_some() && !table.has_value(frame) {
+            // Whether it has one of the signals depends on its bytes.
+            values.clear();
+            decoder.decode_data(reference, frame.data(), values);
+            if values.is_empty() {
+                return;
+            }
+            table.push_values(record, values);
+        } else {
+            table.push(record);
+        }
+        *decoded += 1;
+    }
+
+    /// How many frames were decoded, and how many values they had.
+    fn counts(&mut self) -> (u64, u64) {
+        (self.decoded, self.tables.iter_mut().flatten().map(|table| table.values()).sum())
     }
 
     fn finish(mut self) -> Tables {
@@ -133,13 +155,11 @@ pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)
         options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
     let mut tables = PerMessage::new(decoder, &options.signals)?;
     let report = Report::default();
-    walk(py, &options, &report, |record, source| {
-        if let Some(values) = tables.push(record) {
-            source.counts.decoded += 1;
-            source.counts.values += values as u64;
-        }
+    walk(py, &options, &report, |record| {
+        tables.push(record);
         Ok(())
     })?;
+    report.set_decoded(py.detach(|| tables.counts()));
     Ok((tables.finish(), Py::new(py, report)?))
 }
 
@@ -167,12 +187,13 @@ pub fn decode_table(
 /// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
 fn named(
     decoder: &Decoder,
-    mut tables: HashMap<MessageRef, MessageColumns>,
+    mut tables: Vec<Option<Box<MessageColumns>>>,
     chosen: Option<&Selection>,
 ) -> Vec<(String, Table)> {
     let mut named: Vec<(String, Table)> = Vec::new();
     for (reference, channel, message) in decoder.messages() {
-        let Some(mut table) = tables.remove(&reference) else { continue };
+        let table = tables[reference.index()].take().filter(|table| table.rows() > 0);
+        let Some(mut table) = table else { continue };
         let mut name = message.name.clone();
         if named.iter().any(|(other, _)| *other == name) {
             name = format!("{name}-{}", message.id);
@@ -229,7 +250,7 @@ pub fn search(
     let (mut found, mut places) = (FrameColumns::default(), Vec::new());
     let mut place = 0_u64;
     let report = Report::default();
-    walk(py, &options, &report, |record, _| {
+    walk(py, &options, &report, |record| {
         let is_wanted = max_count.is_none_or(|most| (places.len() as u64) < most);
         if search.finds(record) && is_wanted {
             found.push(record);

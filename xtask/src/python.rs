@@ -59,15 +59,22 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     }
     // Lints first: they need no wheel.
     cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
+    cmd!(shell, "cargo clippy --manifest-path {MANIFEST} -- -D warnings")
+        .env("CARGO_TARGET_DIR", workspace::target())
+        .run()?;
     let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap").run()?;
     cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
     let suite = python_can(shell, &python)?;
     let pytest = python.with_file_name("python");
+    // As the tests' step leaves it; without it those say that they were skipped that need a server.
+    let command = workspace::target().join("debug/cantap");
+    let named = command.exists().then_some(("CANTAP_COMMAND", command));
     // Not from `python/`, where `import cantap` would find the sources.
     cmd!(shell, "{pytest} -m pytest --quiet python/tests --ignore python/tests/test_fleet.py")
         .env("CANTAP_PYTHON_CAN_SOURCE", suite)
+        .envs(named)
         .run()?;
     fleet::check(shell, &wheel)?;
     Ok(Outcome::Passed)

@@ -52,6 +52,9 @@ pub struct Events {
     tx_errors: UInt8Builder,
     rx_errors: UInt8Builder,
     tag: UInt32Builder,
+    /// Rows of the table's own at the end, of which only time and channel are in the columns yet: there is nothing else to say about
+    /// them, and most rows are such.
+    plain: usize,
 }
 
 /// What a record says beside time and channel.
@@ -88,11 +91,42 @@ impl Events {
             tx_errors: UInt8Builder::new(),
             rx_errors: UInt8Builder::new(),
             tag: UInt32Builder::new(),
+            plain: 0,
         }
     }
 
     /// Appends a row for the record; a frame is one of the table's own.
     pub fn push(&mut self, record: &TraceRecord) {
+        if matches!(record.event, TraceEvent::Frame { .. }) {
+            self.time.append_value(record.time_ns);
+            self.channel.append_value(record.channel);
+            self.plain += 1;
+        } else {
+            self.push_event(record);
+        }
+    }
+
+    /// Appends several rows of the table's own for a frame.
+    pub fn push_n(&mut self, record: &TraceRecord, rows: usize) {
+        self.time.append_value_n(record.time_ns, rows);
+        self.channel.append_value_n(record.channel, rows);
+        self.plain += rows;
+    }
+
+    /// Has the plain rows in all columns.
+    fn complete(&mut self) {
+        let rows = std::mem::take(&mut self.plain);
+        self.event.push_n(0, rows);
+        self.detail.push_none(rows);
+        self.count.append_nulls(rows);
+        self.at_least.append_nulls(rows);
+        self.tx_errors.append_nulls(rows);
+        self.rx_errors.append_nulls(rows);
+        self.tag.append_nulls(rows);
+    }
+
+    fn push_event(&mut self, record: &TraceRecord) {
+        self.complete();
         let said = Said::of(&record.event);
         let index = |detail| self.details.iter().position(|known| *known == detail).map(|at| at as i8);
         let detail = said.detail.and_then(index);
@@ -109,6 +143,7 @@ impl Events {
 
     /// The columns so far; the next ones begin empty.
     pub fn take(&mut self) -> Vec<ArrayRef> {
+        self.complete();
         vec![
             Arc::new(self.time.finish()),
             Arc::new(self.channel.finish()),

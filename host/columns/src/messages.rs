@@ -9,11 +9,16 @@ use arrow_array::builder::{
 use arrow_array::types::Int32Type;
 use arrow_array::{ArrayRef, RecordBatch};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
-use cantap_signals::{Message, Signal, SignalValue};
-use cantap_trace::TraceRecord;
+use cantap_signals::{Decoder, Message, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
+use cantap_trace::{TraceFrame, TraceRecord};
+use rustc_hash::FxHashMap;
 
 use crate::events;
 use crate::texts::Texts;
+
+/// So many frames are decoded at once: their columns stay in the processor's nearest memory, and what is done once for each signal
+/// counts for nothing.
+const ROWS_AT_ONCE: usize = 512;
 
 /// One message's frames as columns: `time`, `channel`, `id`, then for each signal its physical value as float64 under its own name,
 /// null where the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle
@@ -24,16 +29,62 @@ pub struct MessageColumns {
     channel: UInt8Builder,
     id: UInt32Builder,
     signals: Vec<Column>,
+    /// The last rows' frames, of which there are no values in the columns yet.
+    waiting: MessageRows,
+    values: u64,
+    scratch: Scratch,
 }
 
 struct Column {
     value: Float64Builder,
-    text: Option<(Texts<Int32Type>, HashMap<i64, i32>)>,
+    text: Option<(Texts<Int32Type>, Keys)>,
+}
+
+/// The texts' indexes by what stands in the frame.
+enum Keys {
+    /// Of a short signal by its bits; [`NO_TEXT`] where the table has none.
+    ByBits(Vec<i32>),
+    /// By [`Signal::table_key`].
+    ByValue(FxHashMap<i64, i32>),
+}
+
+const NO_TEXT: i32 = -1;
+
+#[derive(Default)]
+struct Scratch {
+    values: Vec<SignalValue>,
+    is_value: Vec<bool>,
+    keys: Vec<i32>,
+    is_text: Vec<bool>,
+}
+
+impl Keys {
+    /// Longer signals have a table of their values rather than of their bits.
+    const MOST_BITS: u16 = 8;
+
+    fn of(signal: &Signal) -> Self {
+        let places = signal.values.iter().enumerate().map(|(place, (value, _))| (value, place as i32));
+        let places: FxHashMap<i64, i32> = places.collect();
+        if !(1..=Self::MOST_BITS).contains(&signal.length) {
+            return Self::ByValue(places);
+        }
+        let place = |raw| signal.table_key(raw).and_then(|key| places.get(&key)).copied();
+        Self::ByBits((0..1 << signal.length).map(|raw| place(raw).unwrap_or(NO_TEXT)).collect())
+    }
+
+    fn get(&self, signal: &Signal, raw: u64) -> i32 {
+        match self {
+            Self::ByBits(places) => places.get(raw as usize).copied(),
+            Self::ByValue(places) => signal.table_key(raw).and_then(|key| places.get(&key)).copied(),
+        }
+        .unwrap_or(NO_TEXT)
+    }
 }
 
 impl MessageColumns {
-    /// A table for this message.
-    pub fn new(message: &Message) -> Self {
+    /// A table for a message of this decoder: of its signals those have values that were chosen by now.
+    pub fn new(decoder: &Decoder, reference: MessageRef) -> Self {
+        let message = decoder.message(reference);
         let mut fields = events::fields();
         fields.truncate(2);
         fields.push(Field::new("id", DataType::UInt32, false));
@@ -43,8 +94,7 @@ impl MessageColumns {
             fields.push(Field::new(&*label, DataType::Float64, true).with_metadata(metadata(signal)));
             let text = (!signal.values.is_empty()).then(|| {
                 fields.push(Field::new(format!("{label}.text"), Texts::<Int32Type>::data_type(), true));
-                let places = signal.values.iter().enumerate().map(|(place, (raw, _))| (raw, place as i32));
-                (Texts::new(signal.values.iter().map(|(_, text)| text)), places.collect())
+                (Texts::new(signal.values.iter().map(|(_, text)| text)), Keys::of(signal))
             });
             signals.push(Column { value: Float64Builder::new(), text });
         }
@@ -62,6 +112,9 @@ impl MessageColumns {
             channel: UInt8Builder::new(),
             id: UInt32Builder::new(),
             signals,
+            waiting: decoder.rows(reference),
+            values: 0,
+            scratch: Scratch::default(),
         }
     }
 
@@ -70,26 +123,80 @@ impl MessageColumns {
         Arc::clone(&self.schema)
     }
 
-    /// Appends a row for a frame of the message, with the values that were decoded from it; nothing for another record.
-    pub fn push(&mut self, message: &Message, record: &TraceRecord, values: &[SignalValue]) {
+    /// Whether this frame has a value for the table, whatever its bytes are: chosen signals may be there in some frames only.
+    pub fn has_value(&self, frame: &TraceFrame) -> bool {
+        self.waiting.is_certain(frame.data_len())
+    }
+
+    /// Appends a row for a data frame of the message, with what the decoder gives for it; nothing for another record.
+    #[inline]
+    pub fn push(&mut self, record: &TraceRecord) {
         let Some(frame) = record.frame() else { return };
-        self.time.append_value(record.time_ns);
-        self.channel.append_value(record.channel);
-        self.id.append_value(frame.id().raw());
+        if !self.waiting.push(frame.data()) {
+            let mut values = std::mem::take(&mut self.scratch.values);
+            values.clear();
+            self.waiting.one(frame.data(), &mut values);
+            self.push_values(record, &values);
+            self.scratch.values = values;
+            return;
+        }
+        self.begin_row(record, frame);
+        if self.waiting.len() >= ROWS_AT_ONCE {
+            self.decode();
+        }
+    }
+
+    /// Appends a row for a frame of the message, with the values that were decoded from it; nothing for another record.
+    pub fn push_values(&mut self, record: &TraceRecord, values: &[SignalValue]) {
+        let Some(frame) = record.frame() else { return };
+        self.decode();
+        self.begin_row(record, frame);
+        self.values += values.len() as u64;
+        let message = self.waiting.message();
         for value in values {
             let signal = &message.signals[value.signal as usize];
             let column = &mut self.signals[value.signal as usize];
             let is_value = message.indicator(signal, value.raw).is_none();
             column.value.append_option(is_value.then_some(value.value));
-            if let Some((texts, places)) = &mut column.text {
-                texts.push_option(signal.table_key(value.raw).and_then(|key| places.get(&key)).copied());
+            if let Some((texts, keys)) = &mut column.text {
+                texts.push_option(Some(keys.get(signal, value.raw)).filter(|key| *key != NO_TEXT));
             }
         }
+        self.fill();
+    }
+
+    fn begin_row(&mut self, record: &TraceRecord, frame: &TraceFrame) {
+        self.time.append_value(record.time_ns);
+        self.channel.append_value(record.channel);
+        self.id.append_value(frame.id().raw());
+    }
+
+    /// Decodes the frames that wait for it.
+    fn decode(&mut self) {
+        if self.waiting.is_empty() {
+            return;
+        }
+        let Self { signals, waiting, values, scratch, .. } = self;
+        waiting.decode(|message, rows| {
+            let signal = &message.signals[rows.signal as usize];
+            let column = &mut signals[rows.signal as usize];
+            column.push(message, signal, &rows, scratch);
+            *values += rows.there.map_or(rows.raw.len(), |there| there.iter().filter(|there| **there).count())
+                as u64;
+        });
+        self.fill();
+    }
+
+    /// Columns without a value in the last rows get none.
+    fn fill(&mut self) {
         let rows = self.time.len();
-        for column in self.signals.iter_mut().filter(|column| column.value.len() < rows) {
-            column.value.append_null();
-            if let Some((texts, _)) = &mut column.text {
-                texts.push_option(None);
+        for column in &mut self.signals {
+            let missing = rows - column.value.len();
+            if missing > 0 {
+                column.value.append_nulls(missing);
+                if let Some((texts, _)) = &mut column.text {
+                    texts.push_none(missing);
+                }
             }
         }
     }
@@ -99,8 +206,15 @@ impl MessageColumns {
         self.time.len()
     }
 
+    /// How many values were decoded so far, those included that only say that there is none.
+    pub fn values(&mut self) -> u64 {
+        self.decode();
+        self.values
+    }
+
     /// The rows so far; the next ones begin a new batch.
     pub fn take(&mut self) -> RecordBatch {
+        self.decode();
         let mut columns: Vec<ArrayRef> =
             vec![Arc::new(self.time.finish()), Arc::new(self.channel.finish()), Arc::new(self.id.finish())];
         for column in &mut self.signals {
@@ -108,6 +222,30 @@ impl MessageColumns {
             columns.extend(column.text.as_mut().map(|(texts, _)| texts.take()));
         }
         RecordBatch::try_new(self.schema(), columns).expect("columns are as the schema says")
+    }
+}
+
+impl Column {
+    /// Appends a signal's values in several frames.
+    fn push(&mut self, message: &Message, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
+        let is_there = |at: usize| rows.there.is_none_or(|there| there[at]);
+        if rows.there.is_none() && !message.j1939 {
+            self.value.append_slice(rows.value);
+        } else {
+            let is_value =
+                |(at, raw): (usize, &u64)| is_there(at) && message.indicator(signal, *raw).is_none();
+            scratch.is_value.clear();
+            scratch.is_value.extend(rows.raw.iter().enumerate().map(is_value));
+            self.value.append_values(rows.value, &scratch.is_value);
+        }
+        if let Some((texts, keys)) = &mut self.text {
+            scratch.keys.clear();
+            scratch.keys.extend(rows.raw.iter().map(|raw| keys.get(signal, *raw)));
+            scratch.is_text.clear();
+            let is_text = |(at, key): (usize, &i32)| *key != NO_TEXT && is_there(at);
+            scratch.is_text.extend(scratch.keys.iter().enumerate().map(is_text));
+            texts.push_all(&scratch.keys, &scratch.is_text);
+        }
     }
 }
 

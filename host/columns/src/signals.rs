@@ -9,6 +9,7 @@ use arrow_array::types::Int32Type;
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use cantap_signals::{Decoder, Indicator, MessageRef, SignalValue};
 use cantap_trace::{TraceEvent, TraceRecord};
+use rustc_hash::FxHashMap;
 
 use crate::events::{self, Events};
 use crate::texts::Texts;
@@ -35,7 +36,8 @@ pub struct SignalColumns {
     raw: UInt64Builder,
     text: Texts<Int32Type>,
     unit: Texts<Int32Type>,
-    keys: Arc<HashMap<MessageRef, MessageKeys>>,
+    /// By [`MessageRef::index`].
+    keys: Arc<[MessageKeys]>,
     indicators: [i32; 2],
 }
 
@@ -51,7 +53,7 @@ struct MessageKeys {
 struct SignalKeys {
     signal: i32,
     unit: Option<i32>,
-    texts: HashMap<i64, i32>,
+    texts: FxHashMap<i64, i32>,
 }
 
 /// Texts, each once, in the order in which they came.
@@ -95,16 +97,16 @@ impl SignalColumns {
     pub fn new(decoder: &Decoder) -> Self {
         let [mut messages, mut signals, mut texts, mut units] = [(); 4].map(|()| Interned::default());
         let indicators = [Indicator::Error, Indicator::NotAvailable].map(|what| texts.place(what.name()));
-        let keys = decoder.messages().map(|(reference, _, message)| {
+        let keys = decoder.messages().map(|(_, _, message)| {
             let signals = message.signals.iter().map(|signal| SignalKeys {
                 signal: signals.place(&signal.label()),
                 unit: (!signal.unit.is_empty()).then(|| units.place(&signal.unit)),
                 texts: signal.values.iter().map(|(raw, text)| (raw, texts.place(text))).collect(),
             });
             let signals = signals.collect();
-            (reference, MessageKeys { message: messages.place(&message.name), signals })
+            MessageKeys { message: messages.place(&message.name), signals }
         });
-        let keys = Arc::new(keys.collect());
+        let keys = keys.collect();
         Self {
             schema: Arc::new(Schema::new(fields())),
             events: Events::new(VALUE),
@@ -153,8 +155,13 @@ impl SignalColumns {
         reference: MessageRef,
         values: &[SignalValue],
     ) {
-        let (Some(frame), Some(keys)) = (record.frame(), self.keys.get(&reference)) else { return };
+        let (Some(frame), Some(keys)) = (record.frame(), self.keys.get(reference.index())) else { return };
         let message = decoder.message(reference);
+        let (id, rows) = (frame.id(), values.len());
+        self.events.push_n(record, rows);
+        self.id.append_value_n(id.raw(), rows);
+        self.extended.append_n(rows, id.is_extended());
+        self.message.push_n(keys.message, rows);
         for value in values {
             let (signal, keys_of) =
                 (&message.signals[value.signal as usize], &keys.signals[value.signal as usize]);
@@ -167,10 +174,6 @@ impl SignalColumns {
             // A table may name these values itself.
             let table = || signal.table_key(value.raw).and_then(|key| keys_of.texts.get(&key)).copied();
             let named = if keys_of.texts.is_empty() { None } else { table() };
-            self.events.push(record);
-            self.id.append_value(frame.id().raw());
-            self.extended.append_value(frame.id().is_extended());
-            self.message.push(keys.message);
             self.signal.push(keys_of.signal);
             self.value.append_option(indicator.is_none().then_some(value.value));
             self.raw.append_value(value.raw);

@@ -39,6 +39,21 @@ impl<K: ArrowDictionaryKeyType> Texts<K> {
         self.keys.append_option(key);
     }
 
+    /// Appends the text of this index several times.
+    pub fn push_n(&mut self, key: K::Native, times: usize) {
+        self.keys.append_value_n(key, times);
+    }
+
+    /// Appends no text several times.
+    pub fn push_none(&mut self, times: usize) {
+        self.keys.append_nulls(times);
+    }
+
+    /// Appends the texts of these indexes; none where `is_text` is false.
+    pub fn push_all(&mut self, keys: &[K::Native], is_text: &[bool]) {
+        self.keys.append_values(keys, is_text);
+    }
+
     /// The column so far; the next one begins empty.
     pub fn take(&mut self) -> ArrayRef {
         let texts = Arc::clone(&self.texts) as ArrayRef;

@@ -3,9 +3,11 @@
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
 use cantap_columns::{FrameColumns, MessageColumns, SignalColumns, records};
-use cantap_signals::{Decoder, Source, dbc};
+use cantap_signals::{
+    ByteOrder, Database, Decoder, Message, Multiplexed, Signal, Source, ValueKind, ValueTable, dbc,
+};
 use cantap_trace::testing::record_or_fd;
-use cantap_trace::{Direction, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
 proptest! {
@@ -91,14 +93,13 @@ fn values_have_names_texts_units_and_losses_beside_them() {
 #[test]
 fn a_message_has_a_column_for_each_signal() {
     let decoder = decoder();
-    let (reference, _, message) = decoder.messages().next().unwrap();
-    let mut columns = MessageColumns::new(message);
-    let mut values = Vec::new();
+    let (reference, ..) = decoder.messages().next().unwrap();
+    let mut columns = MessageColumns::new(&decoder, reference);
     // The second frame is too short for the speed.
     for record in [frame(1_000, "100#0364000000000000"), frame(2_000, "100#04")] {
-        assert_eq!(decoder.decode(2, record.frame().unwrap(), &mut values), Some(reference));
-        columns.push(message, &record, &values);
+        columns.push(&record);
     }
+    assert_eq!((columns.rows(), columns.values()), (2, 3));
     let batch = columns.take();
     let names: Vec<_> = batch.schema().fields().iter().map(|field| field.name().clone()).collect();
     assert_eq!(names, ["time", "channel", "id", "Lever", "Lever.text", "Speed"]);
@@ -110,4 +111,75 @@ fn a_message_has_a_column_for_each_signal() {
     let texts = text.values().as_string::<i32>();
     let text: Vec<_> = text.keys().iter().map(|key| texts.value(key.unwrap() as usize)).collect();
     assert_eq!(text, ["Drive", "Drive"]);
+}
+
+prop_compose! {
+    fn signal()(
+        big: bool,
+        kind in prop::sample::select(vec![
+            ValueKind::Unsigned, ValueKind::Signed, ValueKind::SignMagnitude, ValueKind::Half, ValueKind::Single, ValueKind::Double,
+        ]),
+        start in 0u16..100,
+        length in 1u16..=64,
+        (factor, offset) in prop::sample::select(vec![(1.0, 0.0), (0.1, -40.0), (1.0 / 3.0, 0.5), (1000.0, 0.0)]),
+        texts in prop::collection::vec((-2i64..10, "[a-c]"), 0..4),
+        multiplexed in prop::option::of((0usize..6, 0u64..4)),
+    ) -> Signal {
+        let order = if big { ByteOrder::Big } else { ByteOrder::Little };
+        let length = match kind {
+            ValueKind::Half => 16,
+            ValueKind::Single => length.clamp(10, 32),
+            ValueKind::Double => length.max(13),
+            _ => length,
+        };
+        let values = ValueTable::new(texts);
+        let multiplexed = multiplexed.map(|(switch, last)| Multiplexed { switch, values: vec![0..=last] });
+        Signal { order, kind, factor, offset, values, multiplexed, ..Signal::new("S", start, length) }
+    }
+}
+
+proptest! {
+    /// Frames that are decoded together have the values that each has alone: whatever the signals are, of J1939 and not, chosen and
+    /// not, in short frames and in those of CAN FD.
+    #[test]
+    fn frames_are_decoded_together_as_one_by_one(
+        signals in prop::collection::vec(signal(), 1..6),
+        j1939: bool,
+        chosen in prop::collection::vec(any::<bool>(), 6),
+        data in prop::collection::vec((prop::sample::select(vec![0, 1, 2, 5, 7, 8, 8, 8, 8, 8, 8, 8, 12, 64]), any::<u64>()), 1..40),
+        ones: bool,
+    ) {
+        let id = if j1939 { Id::extended(0x18FE_F100) } else { Id::standard(0x123) }.unwrap();
+        let (name, description) = ("M".to_owned(), String::new());
+        let mut signals = signals;
+        for (at, signal) in signals.iter_mut().enumerate() {
+            signal.name = format!("S{at}");
+        }
+        let message = Message { id, name, description, length: 8, cycle_ms: None, j1939, signals, line: 0 };
+        let database = Database { messages: vec![message], ..Database::default() };
+        let mut decoder = Decoder::new(vec![Source { channel: None, database }]);
+        decoder.retain(|_, index, _| chosen[index]);
+        let (reference, ..) = decoder.messages().next().unwrap();
+        let (mut together, mut alone) = (MessageColumns::new(&decoder, reference), MessageColumns::new(&decoder, reference));
+        let (mut values, mut count) = (Vec::new(), 0);
+        // Again and again, so that more are decoded than fit into one go.
+        for (at, (len, word)) in data.iter().cycle().take(700).enumerate() {
+            let word = if ones && at % 3 == 0 { u64::MAX } else { word.rotate_left(at as u32) };
+            let bytes = word.to_le_bytes().repeat(8);
+            let frame: TraceFrame = match Frame::data_frame(id, &bytes[..*len]) {
+                Some(frame) => frame.into(),
+                None => FdFrame::new(id, true, false, &bytes[..*len]).unwrap().into(),
+            };
+            let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
+            let record = TraceRecord { time_ns: at as i64, channel: 1, event };
+            prop_assert_eq!(decoder.decode(1, &frame, &mut values), Some(reference));
+            prop_assert!(!together.has_value(&frame) || !values.is_empty());
+            together.push(&record);
+            alone.push_values(&record, &values);
+            count += values.len() as u64;
+        }
+        prop_assert_eq!((together.values(), alone.values()), (count, count));
+        prop_assert_eq!(together.take(), alone.take());
+        prop_assert_eq!(together.rows(), 0);
+    }
 }

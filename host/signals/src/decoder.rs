@@ -7,7 +7,7 @@ use cantap_wire::Id;
 use rustc_hash::FxHashMap;
 
 use super::model::{Database, Message, Signal};
-use super::plan::{MessagePlan, SignalValue};
+use super::plan::{MessagePlan, MessageRows, SignalValue};
 use super::select::{Selection, SelectionError};
 
 /// A database and where it applies.
@@ -22,6 +22,13 @@ pub struct Source {
 /// One message of a [`Decoder`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct MessageRef(u32);
+
+impl MessageRef {
+    /// Its place among [`Decoder::messages`], from 0.
+    pub const fn index(self) -> usize {
+        self.0 as usize
+    }
+}
 
 /// Decodes frames by one or several databases.
 ///
@@ -247,6 +254,12 @@ impl Decoder {
         let place = self.find(channel, frame.id())?;
         self.decode_data(place, frame.data(), values);
         Some(place)
+    }
+
+    /// For frames of this message that are decoded together: much faster than one after another where columns are wanted.
+    pub fn rows(&self, message: MessageRef) -> MessageRows {
+        let (_, message, plan) = &self.messages[message.0 as usize];
+        MessageRows::new(message.clone(), plan.clone())
     }
 
     /// Decodes a message's data of any length, appending to `values`.

@@ -45,7 +45,7 @@ pub use model::{
     Alarm, Alarms, Colour, Database, Digital, Message, Multiplexed, Signal, ValueKind, ValueTable,
 };
 pub use number::Number;
-pub use plan::SignalValue;
+pub use plan::{MessageRows, SignalRows, SignalValue};
 pub use select::{Selection, SelectionError, Suggestion};
 
 /// Reads a database, by its suffix: `.dbc`, `.kcd`, `.sym`, `.arxml`, or `.toml` for cantap's own signal file. Of a KCD or ARXML file

@@ -4,7 +4,11 @@
 //! order, and every signal is cut out of the one that suits it. Signals under the same multiplexer
 //! values form a group whose condition is tested once.
 
+mod rows;
+
 use std::ops::RangeInclusive;
+
+pub use rows::{MessageRows, SignalRows};
 
 use super::fault::MAX_SWITCHES;
 use super::layout;
@@ -161,14 +165,20 @@ impl MessagePlan {
             Payload::Long(data)
         };
         for group in &self.groups {
-            let there = group.conditions.iter().all(|condition| {
-                let switch = condition.switch.extract(payload);
-                switch.is_some_and(|raw| condition.values.iter().any(|range| range.contains(&raw)))
-            });
-            if there {
+            if group.holds(payload) {
                 values.extend(group.signals.iter().filter_map(|plan| plan.decode(message, payload)));
             }
         }
+    }
+}
+
+impl Group {
+    /// Whether the multiplexers select its signals.
+    fn holds(&self, payload: Payload) -> bool {
+        self.conditions.iter().all(|condition| {
+            let switch = condition.switch.extract(payload);
+            switch.is_some_and(|raw| condition.values.iter().any(|range| range.contains(&raw)))
+        })
     }
 }
 

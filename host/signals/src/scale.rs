@@ -45,6 +45,18 @@ impl Scale {
         let scaled = unscaled * self.factor + self.offset;
         if self.divisor == 1.0 { scaled } else { scaled / self.divisor }
     }
+
+    /// Appends the physical value of each: [`Self::apply`], without asking each time whether there is something to do.
+    #[inline]
+    #[expect(clippy::float_cmp, reason = "a power of ten is exact")]
+    pub fn apply_all(self, unscaled: impl Iterator<Item = f64>, values: &mut Vec<f64>) {
+        let Self { factor, offset, divisor } = self;
+        if divisor == 1.0 {
+            values.extend(unscaled.map(|unscaled| unscaled * factor + offset));
+        } else {
+            values.extend(unscaled.map(|unscaled| (unscaled * factor + offset) / divisor));
+        }
+    }
 }
 
 #[cfg(test)]

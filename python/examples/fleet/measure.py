@@ -1,7 +1,7 @@
-"""Measures the job on this machine: `python measure.py TRACE DATABASE --traces 200 --workers 2`.
+"""Measures the job on this machine: `python measure.py TRACE DATABASE --traces 20 40 80 --workers 2`.
 
-A fleet is made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here. Prints seconds of the
-decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be compared.
+Fleets of these sizes are made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here. Prints seconds of
+the decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be compared.
 """
 
 from __future__ import annotations
@@ -76,16 +76,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("trace", type=Path)
     parser.add_argument("database", type=Path)
-    parser.add_argument("--traces", type=int, default=200)
+    parser.add_argument("--traces", type=int, nargs="+", default=[20, 40, 80])
     parser.add_argument("--workers", type=int, default=2)
     chosen = parser.parse_args()
     os.environ["PYSPARK_PYTHON"] = sys.executable
     with tempfile.TemporaryDirectory(prefix="cantap-fleet-") as name:
         folder = Path(name)
-        for part in ("traces", "warm"):
-            (folder / part).mkdir()
-        make(folder / "traces", chosen.trace, chosen.database, chosen.traces)
-        make(folder / "warm", chosen.trace, chosen.database, 8)
         processor = Processor()
         processor.start()
         spark = (
@@ -95,16 +91,22 @@ def main() -> int:
             .getOrCreate()
         )
         spark.sparkContext.setLogLevel("ERROR")
+        failed = 0
         # What a cluster does once is no part of it: workers that start, code that is compiled.
-        failed = command.run(spark, ["decode", str(folder / "warm"), str(folder / "warm-out")])
-        begin, used = time.monotonic(), processor.seconds()
-        failed |= command.run(spark, ["decode", str(folder / "traces"), str(folder / "out")])
-        seconds, used = time.monotonic() - begin, processor.seconds() - used
+        for number, traces in enumerate((8, *chosen.traces)):
+            fleet = folder / f"fleet{number}"
+            fleet.mkdir()
+            make(fleet, chosen.trace, chosen.database, traces)
+            begin, used = time.monotonic(), processor.seconds()
+            failed |= command.run(spark, ["decode", str(fleet), str(folder / "out")])
+            seconds, used = time.monotonic() - begin, processor.seconds() - used
+            shutil.rmtree(folder / "out", ignore_errors=True)
+            print(
+                f"{'' if number else 'warming up: '}{traces} traces, {chosen.workers} workers: {seconds:.1f} s, "
+                f"{traces / seconds:.2f} traces/s; {used:.1f} processor seconds, {traces / used:.2f} traces per second and core",
+                flush=True,
+            )
         spark.stop()
-    print(
-        f"{chosen.traces} traces, {chosen.workers} workers: {seconds:.1f} s, {chosen.traces / seconds:.2f} traces/s; "
-        f"{used:.1f} processor seconds, {chosen.traces / used:.2f} traces per second and core"
-    )
     return failed
 
 

@@ -1,5 +1,6 @@
 //! What is heard, for Python.
 
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -8,7 +9,7 @@ use cantap_trace::TraceRecord;
 use cantap_trace::socketcan::ErrorFrame;
 use cantap_trace::{Direction, TraceEvent};
 use pyo3::prelude::*;
-use pyo3::types::PyBytes;
+use pyo3::types::PyByteArray;
 
 use super::Device;
 use super::fanout::{Listener, lock};
@@ -26,7 +27,12 @@ pub struct Records {
     _device: Py<Device>,
     listener: Arc<Listener>,
     waiting: Mutex<std::vec::IntoIter<TraceRecord>>,
+    /// The plugin has messages that it did not give to anybody yet.
+    is_handed_out: AtomicBool,
 }
+
+/// So many messages cross to Python at a time: the way there costs as much as a message.
+const MOST_MESSAGES: usize = 64;
 
 /// Until when to wait for something.
 #[derive(Clone, Copy)]
@@ -58,7 +64,7 @@ enum Next {
 
 impl Records {
     pub fn new(device: Py<Device>, listener: Arc<Listener>) -> Self {
-        Self { _device: device, listener, waiting: Mutex::default() }
+        Self { _device: device, listener, waiting: Mutex::default(), is_handed_out: AtomicBool::new(false) }
     }
 
     /// One that is there already.
@@ -100,31 +106,22 @@ impl Records {
     }
 }
 
-/// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; length code, data,
-/// whether it was received, channel from 1.
-type Message<'py> = (f64, u32, bool, bool, bool, u8, Bound<'py, PyBytes>, bool, u8);
+/// A message as python-can's constructor takes it: time, identifier, whether it is extended, remote, an error; channel from 0, length
+/// code, data, whether it is of CAN FD, whether it was received.
+type Message<'py> = (f64, u32, bool, bool, bool, u8, u8, Bound<'py, PyByteArray>, bool, bool);
 
 fn message<'py>(py: Python<'py>, record: &TraceRecord) -> Message<'py> {
     let time_s = record.time_ns as f64 / 1e9;
-    let channel = record.channel;
+    let channel = record.channel.wrapping_sub(1);
     if let TraceEvent::Frame { frame, direction, .. } = &record.event {
         let (id, is_rx) = (frame.id(), *direction == Direction::Rx);
-        let data = PyBytes::new(py, frame.data());
-        return (
-            time_s,
-            id.raw(),
-            id.is_extended(),
-            frame.is_remote(),
-            false,
-            frame.dlc(),
-            data,
-            is_rx,
-            channel,
-        );
+        let data = PyByteArray::new(py, frame.data());
+        let (is_extended, is_remote, dlc) = (id.is_extended(), frame.is_remote(), frame.dlc());
+        return (time_s, id.raw(), is_extended, is_remote, false, channel, dlc, data, false, is_rx);
     }
     let (classes, data) =
         ErrorFrame::of(&record.event).map_or((0, [0; 8]), |error| (error.classes, error.data));
-    (time_s, classes, true, false, true, 8, PyBytes::new(py, &data), true, channel)
+    (time_s, classes, true, false, true, channel, 8, PyByteArray::new(py, &data), false, true)
 }
 
 #[pymethods]
@@ -178,12 +175,25 @@ impl Records {
         Ok(Table::of_batch(columns.take()))
     }
 
-    /// For the plugin: the next record as python-can's message; `None` if there is none within the time.
-    fn _message<'py>(&self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Option<Message<'py>>> {
-        match self.next(py, Until::of(timeout)?)? {
-            Next::One(record) => Ok(Some(message(py, &record))),
-            Next::Nothing => Ok(None),
-            Next::End => Err(DeviceError::new_err("the device is closed")),
+    /// For the plugin: the next records as python-can's messages, those that are at hand; none if there is none within the time.
+    /// Until [`Self::_used_up`] they count as waiting.
+    fn _messages<'py>(&self, py: Python<'py>, timeout: Option<f64>) -> PyResult<Vec<Message<'py>>> {
+        let first = match self.next(py, Until::of(timeout)?)? {
+            Next::One(record) => record,
+            Next::Nothing => return Ok(Vec::new()),
+            Next::End => return Err(DeviceError::new_err("the device is closed")),
+        };
+        self.is_handed_out.store(true, Ordering::Relaxed);
+        // Nothing is locked while Python makes objects.
+        let more: Vec<_> = lock(&self.waiting).by_ref().take(MOST_MESSAGES - 1).collect();
+        Ok(std::iter::once(first).chain(more).map(|record| message(py, &record)).collect())
+    }
+
+    /// For the plugin: all messages that were handed out are used up.
+    fn _used_up(&self) {
+        self.is_handed_out.store(false, Ordering::Relaxed);
+        if lock(&self.waiting).as_slice().is_empty() {
+            self.listener.used_up();
         }
     }
 
@@ -214,7 +224,8 @@ impl Records {
 
     /// A file descriptor that is readable while a record waits.
     fn fileno(&self) -> PyResult<i32> {
-        let is_waiting = !lock(&self.waiting).as_slice().is_empty();
+        let is_waiting =
+            self.is_handed_out.load(Ordering::Relaxed) || !lock(&self.waiting).as_slice().is_empty();
         self.listener.signal(is_waiting)?;
         #[cfg(unix)]
         if let Some(descriptor) = self.listener.descriptor() {

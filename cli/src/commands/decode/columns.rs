@@ -65,7 +65,7 @@ impl PerMessage {
         Ok(Self { folder: folder.to_owned(), files: HashMap::new(), names, events: None })
     }
 
-    pub fn push(&mut self, decoded: &Decoded) -> Result<(), ParquetError> {
+    pub fn push(&mut self, decoder: &Decoder, decoded: &Decoded) -> Result<(), ParquetError> {
         let Decoded { record, reference, message, values, .. } = decoded;
         if !self.files.contains_key(reference) {
             let fit = |c: char| if c.is_alphanumeric() || "-_ ".contains(c) { c } else { '_' };
@@ -75,10 +75,11 @@ impl PerMessage {
                 name = format!("{name}-{}", message.id);
             }
             let path = self.folder.join(format!("{name}.parquet"));
-            self.files.insert(*reference, ParquetFile::create(&path, MessageColumns::new(message))?);
+            self.files
+                .insert(*reference, ParquetFile::create(&path, MessageColumns::new(decoder, *reference))?);
         }
         let file = self.files.get_mut(reference).expect("it was made above");
-        file.table.push(message, record, values);
+        file.table.push_values(record, values);
         file.flush()
     }
 

@@ -160,7 +160,7 @@ impl<'a> Output<'a> {
             #[cfg(feature = "parquet")]
             To::Long(long) => long.push(self.decoder, decoded)?,
             #[cfg(feature = "parquet")]
-            To::PerMessage(files) => files.push(decoded)?,
+            To::PerMessage(files) => files.push(self.decoder, decoded)?,
         }
         Ok(())
     }

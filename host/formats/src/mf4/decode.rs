@@ -312,6 +312,16 @@ impl Part {
                         values.keep(value, self.by_order);
                     }
                 }
+                // Nothing waits, and the record has all that it is about: the most frequent case by far.
+                Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete() => {
+                    let (len, number) = (self.groups[group].record_bytes, self.counts[group]);
+                    let Some(record) = self.stream.at(file, self.at, len)? else {
+                        return Ok(Some(self.cut()));
+                    };
+                    self.at += len as u64;
+                    self.counts[group] += 1;
+                    return Ok(Some(bus.item(record, number, None, self.start_ns, place)));
+                }
                 Content::Signals | Content::Bus(_) => {
                     let len = self.groups[group].record_bytes;
                     let Some(record) = self.stream.at(file, self.at, len)? else {
@@ -386,10 +396,7 @@ impl Part {
                 }
             }
         };
-        let item = match bus.record(record, *number, apart.as_deref(), self.start_ns) {
-            Ok(record) => Item::Record(record),
-            Err(fault) => Item::Fault(place, fault),
-        };
+        let item = bus.item(record, *number, apart.as_deref(), self.start_ns, place);
         self.waiting.pop_front();
         Ok(Some(item))
     }
@@ -415,6 +422,19 @@ impl Values {
 }
 
 impl BusGroup {
+    /// Whether its records have the bytes of their frames themselves.
+    fn is_complete(&self) -> bool {
+        matches!(self.bytes, None | Some(Bytes::Here(_))) && !matches!(self.events, Events::Other(_))
+    }
+
+    /// What a record at a place says, or what is wrong with it.
+    fn item(&self, record: &[u8], number: u64, apart: Option<&[u8]>, start_ns: i64, place: u64) -> Item {
+        match self.record(record, number, apart, start_ns) {
+            Ok(record) => Item::Record(record),
+            Err(fault) => Item::Fault(place, fault),
+        }
+    }
+
     /// What a record says. `apart`: its frame's bytes, where they are not in it.
     fn record(
         &self,
@@ -469,7 +489,8 @@ impl BusGroup {
             None => raw & EXTENDED != 0 || raw & IDENTIFIER > 0x7FF,
         };
         let id = (raw & IDENTIFIER) as u32;
-        let id = identifier(id, extended, format!("{id:X}").as_bytes())?;
+        let id = identifier(id, extended, b"")
+            .or_else(|_| identifier(id, extended, format!("{id:X}").as_bytes()))?;
         let is_fd = flag(&self.edl, b"1");
         let code = number(&self.dlc);
         let fd = is_fd.then(|| FdFields { brs: flag(&self.brs, b"1"), esi: flag(&self.esi, b"1") });

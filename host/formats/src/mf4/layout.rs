@@ -66,11 +66,19 @@ impl Field {
         if self.bits == 0 || self.bits > 64 {
             return None;
         }
-        let len = (u32::from(self.bit) + self.bits).div_ceil(8) as usize;
+        let mask = u64::MAX >> (64 - self.bits);
+        let end = u32::from(self.bit) + self.bits;
+        if !big_endian
+            && end <= 64
+            && let Some(word) = record.get(self.at..).and_then(<[u8]>::first_chunk)
+        {
+            return Some(u64::from_le_bytes(*word) >> self.bit & mask);
+        }
+        let len = end.div_ceil(8) as usize;
         let bytes = record.get(self.at..)?.get(..len)?;
         let join = |value: u128, byte: &u8| value << 8 | u128::from(*byte);
         let all = if big_endian { bytes.iter().fold(0, join) } else { bytes.iter().rev().fold(0, join) };
-        Some((all >> self.bit) as u64 & (u64::MAX >> (64 - self.bits)))
+        Some((all >> self.bit) as u64 & mask)
     }
 
     /// Whether a flag is set, or a text says what the flag stands for.
@@ -109,21 +117,28 @@ pub(super) struct Clock {
     field: Option<Field>,
     offset_s: f64,
     factor_s: f64,
+    /// A counter of whole nanoseconds, or of a multiple, is exact; as a floating-point number it would not be.
+    step_ns: Option<i64>,
 }
 
+const NS_PER_S: f64 = 1e9;
+
 impl Clock {
+    fn new(field: Option<Field>, offset_s: f64, factor_s: f64) -> Self {
+        let step_ns = (factor_s * NS_PER_S).round();
+        let is_whole = step_ns >= 1.0 && (factor_s * NS_PER_S - step_ns).abs() < 1e-9 * step_ns;
+        let step_ns = (is_whole && offset_s == 0.0).then_some(step_ns as i64);
+        Self { field, offset_s, factor_s, step_ns }
+    }
+
     /// Nanoseconds since the start of the measurement.
     pub(super) fn ns(&self, record: &[u8], number: u64) -> Option<i64> {
-        const NS_PER_S: f64 = 1e9;
         let integer = match &self.field {
             None => i64::try_from(number).ok(),
             Some(field) => field.signed(record),
         };
-        // A counter of whole nanoseconds, or of a multiple, is exact; as a floating-point number it would not be.
-        let step_ns = (self.factor_s * NS_PER_S).round();
-        let is_whole = step_ns >= 1.0 && (self.factor_s * NS_PER_S - step_ns).abs() < 1e-9 * step_ns;
-        if let (Some(integer), true, true) = (integer, is_whole, self.offset_s == 0.0) {
-            return integer.checked_mul(step_ns as i64);
+        if let (Some(integer), Some(step_ns)) = (integer, self.step_ns) {
+            return integer.checked_mul(step_ns);
         }
         let raw = integer.map(|integer| integer as f64).or_else(|| self.field?.float(record))?;
         let ns = (raw * self.factor_s + self.offset_s) * NS_PER_S;
@@ -261,7 +276,7 @@ fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault>
             _ => return Err(Fault::Unsupported("a group whose times are no line over their counter".into())),
         }
     }
-    Ok(Some(Clock { field, offset_s, factor_s }))
+    Ok(Some(Clock::new(field, offset_s, factor_s)))
 }
 
 /// The number at the end of a name: 2 for `CAN2`, 1 where there is none.

@@ -1,0 +1,137 @@
+"""Analysers of other computers: through a real ssh, and over TLS. The server is the command `cantap`, which `CANTAP_COMMAND` names."""
+
+import os
+import pathlib
+import socket
+import subprocess
+import time
+
+import pytest
+
+import cantap
+
+COMMAND = os.environ.get("CANTAP_COMMAND", "")
+pytestmark = pytest.mark.skipif(
+    not COMMAND, reason="CANTAP_COMMAND does not name the command `cantap`, which is the server"
+)
+
+
+def capture(device):
+    """Some frames; none may be missing."""
+    table = device.batch(seconds=2, rows=300)
+    assert len(table) == 300
+    assert all(counts["lost"] == 0 for counts in device.losses.values())
+    return table.to_pyarrow()
+
+
+def run(*command, **options):
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60, **options)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.fixture
+def keys(tmp_path):
+    folder = tmp_path / "keys"
+    run(COMMAND, "serve", "keygen", folder, "--host", "127.0.0.1", "--client", "alice:send", "--client", "bob:listen")
+    return folder
+
+
+@pytest.fixture
+def tls(keys):
+    """A server with keys; its address."""
+    command = [COMMAND, "serve", "-d", "virtual:load=50,wire=joined", "-b", "500k", "--tcp", "0", "--allow", "send"]
+    command += ["--tls", f"{keys}/server.pem,{keys}/server-key.pem", "--clients", keys / "ca.pem"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True)
+    try:
+        heard = []
+        for line in process.stderr:
+            heard.append(line)
+            words = [word.rstrip(".,;:") for word in line.split() if word.startswith("tls://127.0.0.1:")]
+            if words:
+                yield words[0]
+                return
+        pytest.fail("the server tells no address: " + "".join(heard))
+    finally:
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+def test_a_device_behind_tls_is_one_beside_it(tls, keys, monkeypatch):
+    with cantap.open(f"{tls}?keys={keys}/bob") as device:
+        # At the server's bit rate.
+        assert [device.open_channel(channel) for channel in (1, 2)] == [500_000, 500_000]
+        assert set(capture(device)["channel"].to_pylist()) == {1, 2}
+        with pytest.raises(cantap.DeviceError, match="the right to send"):
+            device.send(1, "123#11")
+    monkeypatch.setenv("CANTAP_KEYS", str(keys / "alice"))
+    with cantap.open(tls, 500_000, mode="normal") as device:
+        assert device.info["serial"] == "VIRTUAL" and len(device.send(1, "123#11")) == 1
+
+
+def test_without_the_right_keys_tls_lets_nobody_in(tls, keys, tmp_path, monkeypatch):
+    monkeypatch.delenv("CANTAP_KEYS", raising=False)
+    with pytest.raises(cantap.DeviceError, match="CANTAP_KEYS"):
+        cantap.open(tls)
+    other = tmp_path / "other"
+    run(COMMAND, "serve", "keygen", other, "--host", "127.0.0.1", "--client", "eve:send")
+    with pytest.raises(cantap.DeviceError, match="lets nobody in"):
+        cantap.open(f"{tls}?keys={other}/eve")
+    with pytest.raises(cantap.DeviceError):
+        cantap.open(tls.replace("tls:", "tcp:"))
+
+
+@pytest.fixture
+def ssh(tmp_path, monkeypatch):
+    """An ssh server of this computer with keys of its own, and `CANTAP_SSH` as the way to it."""
+    sshd = pathlib.Path("/usr/sbin/sshd")
+    if not sshd.exists() or not pathlib.Path("/usr/bin/ssh").exists():
+        pytest.skip("there is no ssh and sshd; on Debian run `apt-get install openssh-server`")
+    for key in ("host", "user"):
+        run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", tmp_path / key)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    (tmp_path / "known").write_text(f"[127.0.0.1]:{port} {(tmp_path / 'host.pub').read_text()}")
+    (tmp_path / "server").write_text(
+        f"Port {port}\nListenAddress 127.0.0.1\nHostKey {tmp_path}/host\nPidFile none\nStrictModes no\nUsePAM no\n"
+        f"AuthorizedKeysFile {tmp_path}/user.pub\nPasswordAuthentication no\nKbdInteractiveAuthentication no\n"
+        f"SetEnv PATH={pathlib.Path(COMMAND).resolve().parent}:/usr/bin:/bin\n"
+    )
+    (tmp_path / "client").write_text(
+        f"Host there\n HostName 127.0.0.1\n Port {port}\n IdentityFile {tmp_path}/user\n IdentitiesOnly yes\n"
+        f" UserKnownHostsFile {tmp_path}/known\n StrictHostKeyChecking yes\n"
+    )
+    program = tmp_path / "ssh"
+    program.write_text(f'#!/bin/sh\nexec /usr/bin/ssh -F {tmp_path}/client "$@"\n')
+    program.chmod(0o755)
+    if os.getuid() == 0:
+        # Where it confines itself; a package's own start makes it otherwise.
+        os.makedirs("/run/sshd", exist_ok=True)
+    with (tmp_path / "log").open("w") as log:
+        server = subprocess.Popen([sshd, "-D", "-e", "-f", tmp_path / "server"], stderr=log)
+        try:
+            until = time.monotonic() + 10
+            while subprocess.run([program, "-oBatchMode=yes", "there", "true"], capture_output=True).returncode:
+                if time.monotonic() > until:
+                    pytest.skip("sshd lets nobody in: " + (tmp_path / "log").read_text())
+                time.sleep(0.1)
+            monkeypatch.setenv("CANTAP_SSH", str(program))
+            yield
+        finally:
+            server.terminate()
+            server.wait(timeout=30)
+
+
+def test_a_device_behind_ssh_is_one_beside_it(ssh):
+    with cantap.open("ssh://there/virtual:load=50,wire=joined", 500_000) as device:
+        assert set(capture(device)["channel"].to_pylist()) == {1, 2}
+        assert device.address.startswith("ssh://there")
+    with pytest.raises(cantap.DeviceError, match="allow|right to send"):
+        cantap.open("ssh://there/virtual", 500_000, mode="normal").send(1, "123#11")
+    with cantap.open("ssh://there/virtual:load=0,wire=joined?allow=send", 500_000, mode="normal") as device:
+        assert len(device.send(1, "123#11", timeout=5)) == 1
+
+
+def test_a_computer_that_ssh_does_not_know_is_an_error(ssh):
+    with pytest.raises(cantap.DeviceError, match="nowhere.invalid"):
+        cantap.open("ssh://nowhere.invalid/virtual")

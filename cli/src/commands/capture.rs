@@ -16,7 +16,6 @@ use cantap_trace::filter::Filter;
 use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
 use super::convert::WriteArgs;
-use crate::address::Address;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
@@ -27,6 +26,7 @@ use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
 use crate::{args, stderr};
+use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

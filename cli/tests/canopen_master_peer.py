@@ -81,7 +81,11 @@ def main(host, port, sheet):
     said["timer_pdo"] = node.tpdo[2].wait_for_reception(5) is not None
     said["speed"] = node.tpdo[2]["Speed"].raw
     node.sdo[0x2003].raw = 0x4210
-    said["emergency"] = node.emcy.wait(0x4210, 5).register
+    # It may be there before the write is confirmed.
+    until = time.monotonic() + 5
+    while not node.emcy.log and time.monotonic() < until:
+        time.sleep(0.05)
+    said["emergency"] = [node.emcy.log[-1].code, node.emcy.log[-1].register]
 
     # The node that has no number.
     network.lss.RESPONSE_TIMEOUT = 0.15

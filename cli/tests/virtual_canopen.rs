@@ -84,7 +84,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
         ("sync_pdo", json!(true)),
         ("status", json!(0x0237)),
         ("timer_pdo", json!(true)),
-        ("emergency", json!(1)),
+        ("emergency", json!([0x4210, 1])),
         ("found", json!(true)),
         ("identity", json!([0x29C, 0x4452_5631, 0x1_0000, 1002])),
         ("inquired", json!(1002)),

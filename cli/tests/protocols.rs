@@ -134,6 +134,34 @@ fn decoding_has_what_was_said_between_the_signals() {
 }
 
 #[test]
+fn a_table_has_the_numbers_of_what_was_said() {
+    let database = "version = 1\n[[message]]\nname = \"Session\"\nid = 0x7E0\nlength = 8\n[[message.signal]]\nname = \"Pci\"\nat = \"D1\"\n";
+    let logs = [("bus.log", WORKSHOP), ("car.toml", database)];
+    let decode = |arguments: &[&str]| {
+        let line = ["decode", "bus.log", "--protocols", "-q", "--db", "car.toml", "--csv"];
+        let line: Vec<_> = line.iter().chain(arguments).copied().collect();
+        cantap("table", &logs, &line)
+    };
+    let (code, out, err) = decode(&["--wide"]);
+    assert_eq!(code, Some(0), "{err}");
+    assert!(err.contains("values of protocols are texts or bytes"), "{err}");
+    let lines: Vec<Vec<&str>> = out.lines().map(|line| line.split(',').collect()).collect();
+    let at = |name: &str| lines[0].iter().position(|column| column.starts_with(name)).unwrap();
+    let (pci, nrc) = (at("1:Session.Pci"), at("1:uds.nrc"));
+    let refused = lines.iter().find(|line| line[0] == "2.001500").unwrap();
+    assert_eq!((refused[nrc], refused[pci]), ("49", ""), "{out}");
+    let asked = lines.iter().find(|line| line[0] == "2.000000").unwrap();
+    assert_eq!((asked[nrc], asked[pci]), ("", "3"), "{out}");
+    assert!(lines.iter().all(|line| line.len() == lines[0].len()), "{out}");
+    // At equal distances, each with its last value.
+    let (code, out, err) = decode(&["--resample", "500ms"]);
+    assert_eq!(code, Some(0), "{err}");
+    let times: Vec<f64> =
+        out.lines().skip(1).map(|line| line.split(',').next().unwrap().parse().unwrap()).collect();
+    assert!(times.len() > 3 && times.is_sorted(), "{out}");
+}
+
+#[test]
 fn relatives_that_are_not_read_are_named() {
     let ring = ["0", "1", "2", "3"]
         .map(|round| {

@@ -60,10 +60,16 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let count = decode(args, &decoder, &mut records, &mut output)?;
     let mut summary = serde_json::to_value(&count)?;
     records.missing().put_into(&mut summary);
+    let left_out = output.left_out();
     output.finish(&summary)?;
     let Count { frames, decoded, values, lost, events } = count;
     let said = if args.protocols { format!(", {events} events of protocols") } else { String::new() };
     eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values{said}");
+    if left_out > 0 {
+        eprintln!(
+            "cantap: {left_out} values of protocols are texts or bytes, which a table of numbers has no columns for; --csv without --wide has them"
+        );
+    }
     if lost > 0 {
         eprintln!("cantap: {lost} frames or more are missing in the trace");
     }

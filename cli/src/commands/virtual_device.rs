@@ -4,7 +4,7 @@ use std::io::Write;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use cantap_virtual::{Options, car, open_terminal};
+use cantap_virtual::{Options, canopen, car, open_terminal};
 
 use crate::interrupt;
 
@@ -12,7 +12,9 @@ use crate::interrupt;
 #[derive(clap::Args)]
 #[command(after_help = "Options, separated by commas:\n  \
                         car              a vehicle: 500k on channel 1, 125k on channel 2, its database is printed by --dbc;\n                   \
-                        it goes with errors, disturb, ack, channels, seed, settings, pace, ppm and serial\n  load=PCT         bus load, 0 to 100 (50)\n  \
+                        it goes with errors, disturb, ack, channels, seed, settings, pace, ppm and serial\n  \
+                        canopen          CANopen nodes on channel 1, one of them without a number; --eds prints their sheet;\n                   \
+                        it does not go with load, frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
                         bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
                         burst=N/PERIOD   N frames back to back every PERIOD, in place of a load\n  \
@@ -35,14 +37,21 @@ pub struct Args {
     #[arg(default_value = "")]
     options: Options,
     /// Print the database of the vehicle (a DBC file) and leave.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "eds")]
     dbc: bool,
+    /// Print the sheet of the CANopen nodes (an EDS file) and leave.
+    #[arg(long)]
+    eds: bool,
 }
 
 /// Runs it.
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.dbc {
         std::io::stdout().lock().write_all(car::DATABASE.as_bytes())?;
+        return Ok(ExitCode::SUCCESS);
+    }
+    if args.eds {
+        std::io::stdout().lock().write_all(canopen::SHEET.as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }
     interrupt::watch()?;

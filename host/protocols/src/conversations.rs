@@ -136,18 +136,61 @@ impl Conversations {
         under_way
     }
 
+    /// Leaves out what is of a protocol that is not wanted.
     fn keep_wanted(&self, before: usize, events: &mut Vec<Event>) {
         if self.wanted == u16::MAX {
             return;
         }
         // Only what is new: the caller may keep all events of a long trace in the same vector.
         let mut end = before;
+        let diagnostics = self.wanted & DIAGNOSTICS != 0;
         for at in before..events.len() {
-            if self.wanted & events[at].protocol.bit() != 0 {
+            let Event { protocol, trouble, .. } = &events[at];
+            // A transfer that broke may have been a request, or its response: which, nobody can tell.
+            let broke = diagnostics && *protocol == Protocol::IsoTp && trouble.is_some();
+            if broke || self.wanted & protocol.bit() != 0 {
                 events.swap(end, at);
                 end += 1;
             }
         }
         events.truncate(end);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::testing::at;
+
+    fn said(protocol: Protocol, frames: &[(f64, &str)]) -> Vec<String> {
+        let options = Options { protocols: vec![protocol], ..Options::default() };
+        let (mut conversations, mut events) = (Conversations::new(&options), Vec::new());
+        for (ms, frame) in frames {
+            conversations.take(&at(*ms, frame), &mut events);
+        }
+        conversations.finish(&mut events);
+        events.iter().map(ToString::to_string).collect()
+    }
+
+    /// Who asks for one protocol alone must not take a bus for sound on which its transfers break.
+    #[test]
+    fn transfers_that_break_are_said_whatever_they_would_have_been() {
+        let frames =
+            [(0.0, "7E0#1FFF360102030405"), (1.0, "7E8#320000"), (2.0, "7E0#023E00"), (3.0, "7E8#027E00")];
+        let said_uds = said(Protocol::Uds, &frames);
+        assert_eq!(said_uds.len(), 2, "{said_uds:?}");
+        assert!(said_uds[0].ends_with("refused by the receiver: too long for it"), "{said_uds:?}");
+        assert_eq!(said(Protocol::J1939, &frames), [""; 0]);
+    }
+
+    #[test]
+    fn a_broken_fast_packet_has_its_groups_name() {
+        let broken = said(
+            Protocol::Nmea2000,
+            &[(0.0, "0DF80501#002B000102030405"), (1.0, "0DF80501#020D0E0F10111213")],
+        );
+        assert!(broken[0].starts_with("nmea2000 1 > all GNSS Position Data: "), "{broken:?}");
+        let asked = said(Protocol::Nmea2000, &[(0.0, "18EAFF01#14F001")]);
+        assert!(asked[0].contains("requested 126996 (Product Information)"), "{asked:?}");
     }
 }

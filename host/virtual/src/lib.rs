@@ -13,6 +13,7 @@
 #[cfg(test)]
 mod any_commands;
 mod board;
+pub mod canopen;
 pub mod car;
 mod check;
 mod controller;

@@ -8,6 +8,7 @@ use std::time::Duration;
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS};
 use cantap_wire::{CHANNELS, Frame};
 
+use crate::canopen::CanOpenBus;
 use crate::car::{self, CarBus};
 use crate::simbus::{FrameSource, Frames, Schedule, SimBus, Traffic};
 
@@ -18,6 +19,8 @@ const MAX_SERIAL_BYTES: usize = 24;
 
 /// What a car on the bus leaves no room for.
 const MADE_UP: [&str; 5] = ["load", "frames", "bitrate", "burst", "wire"];
+/// And CANopen nodes, which speak at any bit rate.
+const MADE_UP_FRAMES: [&str; 3] = ["load", "frames", "burst"];
 
 /// How model time passes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -31,7 +34,7 @@ pub enum Pace {
 
 /// The simulated buses, their traffic, and the pace.
 ///
-/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `load` (per cent), `frames` (`std0` `std8` `ext0`
+/// As text: `load=50,frames=std8,bitrate=500k,seed=7`. Keys: `car` (a vehicle in place of made-up frames: see [`crate::car`]), `canopen` (CANopen nodes on the first bus: see [`crate::canopen`]), `load` (per cent), `frames` (`std0` `std8` `ext0`
 /// `ext8` `rtr` `mix`), `bitrate` (by default that of whoever opens the channel), `burst` (`10/960us`: frames
 /// in a burst, and its period), `errors` (per cent of the frames destroyed), `disturb` (this many of the frames that the device
 /// sends first are destroyed on each bus), `ack` (`yes`, `no`), `seed`, `settings` (a file that keeps what the device
@@ -70,6 +73,8 @@ pub struct Options {
     pub serial: String,
     /// A vehicle on the buses, at its own bit rates: see [`crate::car`].
     pub car: bool,
+    /// CANopen nodes on the first bus: see [`crate::canopen`].
+    pub canopen: bool,
     /// Frames to be replayed at their own times (nanoseconds since the start), in place of made-up ones, per channel.
     pub log: Option<[Vec<(u64, Frame)>; CHANNELS]>,
 }
@@ -92,6 +97,7 @@ impl Default for Options {
             crystal_ppm: 0.0,
             serial: "VIRTUAL".to_owned(),
             car: false,
+            canopen: false,
             log: None,
         }
     }
@@ -103,7 +109,7 @@ impl Default for Options {
 pub enum BadOption {
     /// There is no such key.
     #[error(
-        "there is no option '{0}'; there are car, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
+        "there is no option '{0}'; there are car, canopen, load, frames, bitrate, burst, errors, disturb, ack, seed, settings, serial, ppm, pace, wire, channels, log"
     )]
     Unknown(String),
     /// The value does not fit.
@@ -124,7 +130,7 @@ impl FromStr for Options {
     /// An empty text means the defaults.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let mut options = Self::default();
-        let mut made_up = None;
+        let mut given = Vec::new();
         // A file's name may have commas: it takes the rest.
         let (text, log) = match text.strip_prefix("log=") {
             Some(file) => ("", Some(file)),
@@ -136,17 +142,26 @@ impl FromStr for Options {
         for option in text.split(',').filter(|option| !option.is_empty()) {
             let (key, value) = option.split_once('=').unwrap_or((option, ""));
             options.set(key, value)?;
-            if MADE_UP.contains(&key) {
-                made_up = Some(option);
-            }
+            given.push((key, option));
         }
-        match made_up {
-            _ if !options.car => Ok(options),
-            None if options.log.is_none() => Ok(options),
-            option => Err(BadOption::Value {
-                key: "car".to_owned(),
-                value: option.unwrap_or("log").to_owned(),
-                reason: "the car has its own traffic and bit rates; leave out one of the two".to_owned(),
+        let (key, excluded, reason) = match (options.car, options.canopen) {
+            (false, false) => return Ok(options),
+            (true, _) => {
+                ("car", &MADE_UP[..], "the car has its own traffic and bit rates; leave out one of the two")
+            }
+            (false, true) => {
+                ("canopen", &MADE_UP_FRAMES[..], "the nodes have their own traffic; leave out one of the two")
+            }
+        };
+        let wrong =
+            given.iter().rfind(|(other, _)| excluded.contains(other) || key == "car" && *other == "canopen");
+        let wrong = wrong.map(|(_, option)| *option).or(options.log.is_some().then_some("log"));
+        match wrong {
+            None => Ok(options),
+            Some(option) => Err(BadOption::Value {
+                key: key.to_owned(),
+                value: option.to_owned(),
+                reason: reason.to_owned(),
             }),
         }
     }
@@ -167,7 +182,8 @@ impl Options {
         };
         match key {
             "car" if value.is_empty() => self.car = true,
-            "car" => return Err(bad(&"it stands alone")),
+            "canopen" if value.is_empty() => self.canopen = true,
+            "car" | "canopen" => return Err(bad(&"it stands alone")),
             "load" => self.load_percent = percent()?,
             "errors" => self.error_percent = percent()?,
             "frames" => self.frames = value.parse().map_err(|error| bad(&error))?,
@@ -229,6 +245,8 @@ impl Options {
         let schedule = match (log, self.burst) {
             _ if !self.traffic_on[channel] => Schedule::Silent,
             _ if self.car => Schedule::Nodes(Box::new(CarBus::new(channel, self.seed))),
+            _ if self.canopen && channel == 0 => Schedule::Nodes(Box::new(CanOpenBus::in_use())),
+            _ if self.canopen => Schedule::Silent,
             (Some(entries), _) => Schedule::Log { entries: entries.into_iter() },
             (None, Some((length, period))) => {
                 Schedule::Bursts { source: self.source(channel), length, period_ns: period.as_nanos() as u64 }
@@ -300,6 +318,11 @@ mod tests {
                 "car,load=5",
                 "'load=5' does not fit the option 'car': the car has its own traffic and bit rates",
             ),
+            (
+                "canopen,load=5",
+                "'load=5' does not fit the option 'canopen': the nodes have their own traffic",
+            ),
+            ("car,canopen", "'canopen' does not fit the option 'car': the car has its own traffic"),
             ("load=101", "'101' does not fit the option 'load': give per cent, 0 to 100"),
             ("frames=x", "'x' does not fit the option 'frames': choose one of std0"),
             ("serial=", "'' does not fit the option 'serial': give 1 to 24 characters"),

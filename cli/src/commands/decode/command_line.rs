@@ -41,8 +41,9 @@ pub struct Args {
     #[arg(short, long = "signal", value_name = "PATTERN", value_delimiter = ',', add = completion::signals())]
     pub signals: Vec<String>,
     /// Also what frames say together, by the protocols that each channel shows: its fields as signals, named uds.sid, j1939.pgn
-    /// and so on (docs/protocols.md). Not in tables with a column per signal, and not in Parquet.
-    #[arg(long, conflicts_with_all = ["wide", "resample"])]
+    /// and so on (docs/protocols.md). Tables with a column per signal have its numbers; Parquet with a row per value has no
+    /// place for it.
+    #[arg(long)]
     pub protocols: bool,
     #[command(flatten)]
     pub protocol: ProtocolArgs,

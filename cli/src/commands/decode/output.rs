@@ -52,9 +52,10 @@ impl Form {
             ));
         }
         #[cfg(feature = "parquet")]
-        if form == Self::Parquet && args.protocols {
+        if form == Self::Parquet && args.protocols && !args.wide && args.resample.is_none() {
             return Err(wrong(
-                "a Parquet file has no place for what protocols say; write it to a file that ends in .csv or .json",
+                "this table has no place for what protocols say; add --wide or --resample TIME, which make columns of its numbers, or write it to \
+                 a file that ends in .csv or .json",
             ));
         }
         Ok(form)
@@ -171,6 +172,8 @@ impl<'a> Output<'a> {
             To::Lines { lines, json: true, details } => said::json(&mut lines.out, event, *details)?,
             To::Lines { lines, .. } => said::text(&mut lines.out, event)?,
             To::Csv(lines) => said::csv(&mut lines.out, event)?,
+            To::Wide(wide, _) => wide.push_said(event)?,
+            #[cfg(feature = "parquet")]
             // Refused on the command line.
             _ => {}
         }
@@ -190,6 +193,11 @@ impl<'a> Output<'a> {
             _ => {}
         }
         Ok(())
+    }
+
+    /// Texts and bytes of what was said, which the table has no columns for.
+    pub fn left_out(&self) -> u64 {
+        if let To::Wide(wide, _) = &self.to { wide.left_out() } else { 0 }
     }
 
     /// Gives out what waits, where somebody may read along.

@@ -8,15 +8,19 @@ use cantap_trace::Interface;
 use super::csv::field as quoted;
 use super::decoded::Seconds;
 
+/// Whether a name is `name`, or `name_2` and so on: `spn_version` is not the second `spn`.
+fn is_again(known: &str, name: &str) -> bool {
+    known.strip_prefix(name).is_some_and(|rest| {
+        rest.is_empty() || rest.strip_prefix('_').is_some_and(|rest| rest.parse::<usize>().is_ok())
+    })
+}
+
 /// Names and values, with those that every event has behind its own.
 fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
     let mut fields: Vec<(String, Value, String, Option<String>)> = Vec::new();
     for field in &event.fields {
         let name = naming::plain(&field.name);
-        let before = fields
-            .iter()
-            .filter(|(known, ..)| *known == name || known.starts_with(&format!("{name}_")))
-            .count();
+        let before = fields.iter().filter(|(known, ..)| is_again(known, &name)).count();
         let name = if before == 0 { name } else { format!("{name}_{}", before + 1) };
         let text = field.text.as_ref().map(ToString::to_string);
         fields.push((name, field.value.clone(), field.unit.to_string(), text));
@@ -33,6 +37,23 @@ fn fields(event: &Event) -> Vec<(String, Value, String, Option<String>)> {
         add("frames_lost", Value::Number(1));
     }
     fields
+}
+
+/// Names, units and values of an event, each a number as text; `None` for one of its own fields that is none.
+pub fn numbers(event: &Event) -> impl Iterator<Item = (String, String, Option<String>)> {
+    let protocol = event.protocol;
+    let own = event.fields.len();
+    fields(event).into_iter().enumerate().filter_map(move |(place, (name, value, unit, _))| {
+        let number = match value {
+            Value::Number(number) => Some(number.to_string()),
+            Value::Hex(number, _) => Some(number.to_string()),
+            Value::Real(number) if number.is_finite() => Some(number.to_string()),
+            // The kind and what went wrong are words of every event.
+            _ if place >= own => return None,
+            _ => None,
+        };
+        Some((format!("{protocol}.{name}"), unit, number))
+    })
 }
 
 /// The identifier or node that said it; empty where it is not known.

@@ -8,10 +8,12 @@ use std::io::{self, BufRead, BufReader, BufWriter, Seek, Write};
 
 use anyhow::Context;
 use cantap_analysis::Cadence;
+use cantap_protocols::Event;
 use cantap_signals::MessageRef;
 
 use super::csv::field;
 use super::decoded::{Decoded, Reading, Seconds};
+use super::said;
 
 /// Between cells of a waiting line: it stands in no number and no time.
 const SEPARATOR: char = '\x1f';
@@ -20,11 +22,21 @@ const SEPARATOR: char = '\x1f';
 pub struct Wide {
     waiting: BufWriter<File>,
     columns: Vec<Column>,
-    places: HashMap<(u8, MessageRef, u32), usize>,
+    places: HashMap<Place, usize>,
+    /// Texts and bytes of what was said, which no column takes.
+    left_out: u64,
     /// Distance of lines; one per frame without it.
     step_ns: Option<i64>,
     /// When the next line is due.
     due_ns: Option<i64>,
+}
+
+/// What a column is of.
+#[derive(PartialEq, Eq, Hash)]
+enum Place {
+    Signal(u8, MessageRef, u32),
+    /// Of what frames say together, by its name.
+    Field(u8, String),
 }
 
 struct Column {
@@ -42,7 +54,56 @@ impl Wide {
         let file = tempfile::tempfile()
             .context("the lines need room for a temporary file; make some, or name a folder in TMPDIR")?;
         let (columns, places) = (Vec::new(), HashMap::new());
-        Ok(Self { waiting: BufWriter::new(file), columns, places, step_ns, due_ns: None })
+        Ok(Self { waiting: BufWriter::new(file), columns, places, left_out: 0, step_ns, due_ns: None })
+    }
+
+    /// Texts and bytes of what was said, which no column takes.
+    pub const fn left_out(&self) -> u64 {
+        self.left_out
+    }
+
+    /// Takes what frames said together: its numbers.
+    pub fn push_said(&mut self, event: &Event) -> io::Result<()> {
+        // What ends because nothing came is said with the frame that shows it: lines at equal distances do not go back for it.
+        let time_ns = match (self.step_ns, self.due_ns) {
+            (Some(step_ns), Some(due_ns)) => event.time_ns.max(due_ns.saturating_sub(step_ns)),
+            _ => event.time_ns,
+        };
+        self.advance(time_ns)?;
+        let mut cells: Vec<(usize, String)> = Vec::new();
+        for (name, unit, number) in said::numbers(event) {
+            let Some(number) = number else {
+                self.left_out += 1;
+                continue;
+            };
+            let columns = &mut self.columns;
+            let place = *self.places.entry(Place::Field(event.channel, name)).or_insert_with_key(|place| {
+                let name = if let Place::Field(_, name) = place { name.clone() } else { String::new() };
+                let cadence = Cadence::new(None);
+                columns.push(Column { channel: event.channel, name, unit, last: None, cadence });
+                columns.len() - 1
+            });
+            let column = &mut self.columns[place];
+            column.cadence.arrive(time_ns);
+            if self.step_ns.is_none() {
+                cells.push((place, number));
+            } else {
+                column.last = Some((time_ns, number));
+            }
+        }
+        self.line(time_ns, &cells)
+    }
+
+    /// A line of these cells, unless lines stand at equal distances.
+    fn line(&mut self, time_ns: i64, cells: &[(usize, String)]) -> io::Result<()> {
+        if self.step_ns.is_some() || cells.is_empty() {
+            return Ok(());
+        }
+        let mut line = vec![""; self.columns.len()];
+        for (place, text) in cells {
+            line[*place] = text;
+        }
+        write_line(&mut self.waiting, time_ns, &line)
     }
 
     /// Takes a frame.
@@ -63,14 +124,7 @@ impl Wide {
                 column.last = Some((time_ns, text));
             }
         }
-        if self.step_ns.is_none() && !cells.is_empty() {
-            let mut line = vec![""; self.columns.len()];
-            for (place, text) in &cells {
-                line[*place] = text;
-            }
-            write_line(&mut self.waiting, time_ns, &line)?;
-        }
-        Ok(())
+        self.line(time_ns, &cells)
     }
 
     /// Frames of the channel are missing: its last values are the present ones no longer.
@@ -83,7 +137,7 @@ impl Wide {
     fn place(&mut self, decoded: &Decoded, signal: u32, reading: &Reading) -> usize {
         let channel = decoded.record.channel;
         let columns = &mut self.columns;
-        *self.places.entry((channel, decoded.reference, signal)).or_insert_with(|| {
+        *self.places.entry(Place::Signal(channel, decoded.reference, signal)).or_insert_with(|| {
             columns.push(Column {
                 channel,
                 name: format!("{}.{}", decoded.message.name, reading.label),

@@ -236,7 +236,7 @@ impl Diagnostics {
             // What an OBD response repeats of the request is shown once.
             let positive = response.is_some_and(|(response, _)| !refused(&response.data));
             match protocol {
-                Protocol::Obd if positive && matches!(sid, 1 | 2 | 9) => {}
+                Protocol::Obd if positive && matches!(sid, 1 | 2 | 6 | 9) => {}
                 Protocol::Obd => obd::request(sid, &first.data[1..], &mut fields),
                 Protocol::Kwp2000 => uds::kwp_request(&first.data, &mut fields),
                 _ => uds::request(&first.data, &mut fields),

@@ -134,8 +134,9 @@ fn with_severity(bytes: &[u8]) -> String {
     format!("{} [{words}{unit}]", dtc::list_with_status(code))
 }
 
-/// What a positive response says behind the sub-function.
-pub fn response(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
+/// What a positive response says behind the sub-function. What it repeats of a request that was `heard` is left out.
+pub fn response(heard: bool, sub: u8, data: &[u8], fields: &mut Vec<Field>) {
+    let again = |field: Field| (!heard).then_some(field);
     let mask = |mask: u8| Field::hex("available_mask", mask, 2);
     match (sub, data) {
         (0x01 | 0x07 | 0x11 | 0x12, [available, as_what, high, low]) => {
@@ -156,7 +157,8 @@ pub fn response(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
         }
         (0x05 | 0x16, [of, codes @ ..]) if codes.len() >= CODE_AND_STATUS => {
             let (one, record) = codes.split_at(CODE_AND_STATUS);
-            fields.extend([number(*of, 0xFF), Field::text("codes", dtc::list_with_status(one))]);
+            fields.extend(again(number(*of, 0xFF)));
+            fields.push(Field::text("codes", dtc::list_with_status(one)));
             rest("record", record, fields);
         }
         (0x08 | 0x09, [available, codes @ ..]) if codes.len() % 6 == 0 => {
@@ -168,31 +170,36 @@ pub fn response(sub: u8, data: &[u8], fields: &mut Vec<Field>) {
             each(codes, 4, |one| format!("{} (counter {})", code(one), one[3] as i8), fields);
         }
         (0x17, [memory, available, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
-            fields.extend([Field::hex("memory", *memory, 2), mask(*available)]);
+            fields.extend(again(Field::hex("memory", *memory, 2)));
+            fields.push(mask(*available));
             with_status(codes, fields);
         }
         (0x18 | 0x19, [memory, codes @ ..]) if codes.len() >= CODE_AND_STATUS => {
             let (one, record) = codes.split_at(CODE_AND_STATUS);
-            fields
-                .extend([Field::hex("memory", *memory, 2), Field::text("codes", dtc::list_with_status(one))]);
+            fields.extend(again(Field::hex("memory", *memory, 2)));
+            fields.push(Field::text("codes", dtc::list_with_status(one)));
             rest("record", record, fields);
         }
         (0x1A, [available, of, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
-            fields.extend([mask(*available), number(*of, 0xFF)]);
+            fields.push(mask(*available));
+            fields.extend(again(number(*of, 0xFF)));
             with_status(codes, fields);
         }
         (0x42, [group, available, severity, as_what, codes @ ..]) if codes.len() % 5 == 0 => {
-            fields.extend([functional_group(*group), mask(*available)]);
+            fields.extend(again(functional_group(*group)));
+            fields.push(mask(*available));
             fields.extend([Field::hex("available_severity", *severity, 2), format(*as_what)]);
             each(codes, 5, with_severity, fields);
         }
         (0x55, [group, available, as_what, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
-            fields.extend([functional_group(*group), mask(*available), format(*as_what)]);
+            fields.extend(again(functional_group(*group)));
+            fields.extend([mask(*available), format(*as_what)]);
             with_status(codes, fields);
         }
         (0x56, [group, available, as_what, readiness, codes @ ..]) if codes.len() % CODE_AND_STATUS == 0 => {
-            fields.extend([functional_group(*group), mask(*available), format(*as_what)]);
-            fields.push(Field::hex("readiness_group", *readiness, 2));
+            fields.extend(again(functional_group(*group)));
+            fields.extend([mask(*available), format(*as_what)]);
+            fields.extend(again(Field::hex("readiness_group", *readiness, 2)));
             with_status(codes, fields);
         }
         _ => rest("value", data, fields),
@@ -243,7 +250,7 @@ mod tests {
             // What does not suit stays as it is.
             (0x02, vec![0xFF, 1, 2], "value FF 01 02".to_owned()),
         ] {
-            assert_eq!(said(response, sub, &bytes), expected, "{sub:02X}");
+            assert_eq!(said(|sub, data, fields| response(false, sub, data, fields), sub, &bytes), expected, "{sub:02X}");
         }
         for (sub, bytes, expected) in [
             (
@@ -264,7 +271,10 @@ mod tests {
         for sub in 0..=0xFF {
             for length in 0..24 {
                 let bytes = vec![sub; length];
-                let _ = (said(request, sub, &bytes), said(response, sub, &bytes));
+                let _ = (
+                    said(request, sub, &bytes),
+                    said(|sub, data, fields| response(false, sub, data, fields), sub, &bytes),
+                );
             }
         }
     }

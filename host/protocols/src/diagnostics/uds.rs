@@ -199,7 +199,7 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             if !heard {
                 fields.push(sub_function(sid, *sub));
             }
-            reports::response(*sub, data, fields);
+            reports::response(heard, *sub, data, fields);
         }
         (0x27, [sub, data @ ..]) => {
             if !heard {

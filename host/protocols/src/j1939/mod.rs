@@ -86,6 +86,11 @@ impl J1939 {
         }
     }
 
+    /// A group's name.
+    fn group(&self, pgn: u32) -> Option<&'static str> {
+        names::group(pgn).or_else(|| self.marine.as_ref().and_then(|_| nmea2000::name(pgn)))
+    }
+
     fn frame(&mut self, record: &TraceRecord, header: Header, data: &[u8], events: &mut Vec<Event>) {
         let (channel, time_ns) = (record.channel, record.time_ns);
         let mut messages = std::mem::take(&mut self.messages);
@@ -167,6 +172,9 @@ impl J1939 {
             }
             if long.trouble.is_some() {
                 event.kind = "broken";
+                if let Some(name) = self.group(header.pgn) {
+                    event.title = name.into();
+                }
                 event.fields.push(Field::number("received", data.len() as i64).unit("bytes"));
                 events.push(event);
                 return;
@@ -176,7 +184,7 @@ impl J1939 {
             (REQUEST, [a, b, c, ..]) => {
                 let pgn = header::pgn([*a, *b, *c]);
                 event.kind = "request";
-                event.fields.push(Field::number("requested", pgn).meaning(names::group(pgn)));
+                event.fields.push(Field::number("requested", pgn).meaning(self.group(pgn)));
                 self.ask(record, header, pgn, events);
             }
             (ACKNOWLEDGEMENT, [control, function, _, _, address, a, b, c]) => {
@@ -186,7 +194,7 @@ impl J1939 {
                 let said = said.get(usize::from(*control)).copied();
                 event.fields.push(Field::number("control", *control).meaning(said));
                 event.fields.push(Field::number("group_function", *function));
-                event.fields.push(Field::number("requested", pgn).meaning(names::group(pgn)));
+                event.fields.push(Field::number("requested", pgn).meaning(self.group(pgn)));
                 if *address < NULL {
                     event.fields.push(Field::number("of", *address));
                 }
@@ -329,7 +337,7 @@ impl J1939 {
             event.time_ns = request.time_ns.saturating_add(ANSWER_NS);
         }
         event.data.clear();
-        event.fields.push(Field::number("requested", request.pgn).meaning(names::group(request.pgn)));
+        event.fields.push(Field::number("requested", request.pgn).meaning(self.group(request.pgn)));
         event.fields.push(Field::text("response", "none"));
         event.trouble = Some(trouble);
         event.frames_lost = request.frames_lost;

@@ -32,6 +32,12 @@ pub(crate) fn describe(pgn: u32, data: &[u8], fields: &mut Vec<Field>) -> Option
     (!group.fallback).then_some(Cow::Borrowed(group.description.as_str()))
 }
 
+/// The name of a group whose number is only its own.
+pub(crate) fn name(pgn: u32) -> Option<&'static str> {
+    let mut own = Database::get().groups(pgn).iter().filter(|group| !group.fallback);
+    own.next().filter(|_| own.next().is_none()).map(|group| group.description.as_str())
+}
+
 /// Whether a bus that has both means NMEA 2000's group by this number.
 pub(crate) fn is_own(pgn: u32) -> bool {
     (0x1_F000..0x2_0000).contains(&pgn) || is_fast(pgn)

@@ -410,9 +410,9 @@ fn trouble_codes_are_read_and_cleared_and_the_lamp_goes_out() {
     assert_eq!(ask(&mut rig, "7E0#0103000000000000")[..5], [4, 0x43, 1, 0x01, 0x28]);
     assert_eq!(ask(&mut rig, "7E0#031902FF00000000")[..8], [7, 0x59, 2, 0x7F, 0x01, 0x28, 0, 0x2A]);
     assert_eq!(ask(&mut rig, "7E0#02270100000000")[..4], [3, 0x7F, 0x27, 0x11]);
-    assert_eq!(ask(&mut rig, "7DF#02270100000000"), [], "to all, nobody says no");
+    assert!(ask(&mut rig, "7DF#02270100000000").is_empty(), "to all, nobody says no");
     assert_eq!(ask(&mut rig, "7E0#0322123400000000")[..4], [3, 0x7F, 0x22, 0x31]);
-    assert_eq!(ask(&mut rig, "7E0#023E800000000000"), []);
+    assert!(ask(&mut rig, "7E0#023E800000000000").is_empty());
     assert_eq!(ask(&mut rig, "7E0#023E000000000000")[..3], [2, 0x7E, 0]);
     assert_eq!(ask(&mut rig, "7E0#0210030000000000")[..3], [6, 0x50, 3]);
     let lamp = |rig: &Rig| signals(&rig.analyser.heard)["MalfunctionLamp"].last().unwrap().1 > 0.5;

@@ -1,0 +1,109 @@
+"""python-canopen as the master of `virtual:canopen`, for virtual_canopen.rs.
+
+HOST PORT SHEET     joins by socketcand; prints one JSON object with what the nodes said
+"""
+
+import json
+import sys
+import time
+
+import can
+import canopen
+
+NODE, NEW_NODE = 5, 9
+LONG = bytes(range(256)) * 5 + b"the end"
+
+
+def attempt(action):
+    """What an action gives, or the abort code."""
+    try:
+        return action()
+    except canopen.SdoAbortedError as error:
+        return f"{error.code:08X}"
+
+
+def write_blocks(node, data):
+    with node.sdo.open(0x2000, 0, "wb", size=len(data), block_transfer=True) as stream:
+        stream.write(data)
+
+
+def read_blocks(node):
+    with node.sdo.open(0x2000, 0, "rb", block_transfer=True) as stream:
+        return stream.read()
+
+
+def main(host, port, sheet):
+    network = canopen.Network()
+    network.bus = can.Bus(interface="socketcand", host=host, port=int(port), channel="can0")
+    network.notifier = can.Notifier(network.bus, network.listeners, 0.01)
+    said = {}
+
+    node = network.add_node(NODE, sheet)
+    node.sdo.RESPONSE_TIMEOUT = 5.0
+    said["name"] = node.sdo[0x1008].raw
+    said["serial"] = node.sdo[0x1018][4].raw
+    node.sdo[0x2001].raw = -1234
+    said["target"] = node.sdo[0x2001].raw
+    said["refused"] = [
+        attempt(lambda: node.sdo.download(0x1000, 0, b"\0\0\0\0")),
+        attempt(lambda: node.sdo.upload(0x2005, 0)),
+        attempt(lambda: node.sdo.upload(0x3000, 0)),
+        attempt(lambda: node.sdo.download(0x1017, 0, b"\0")),
+    ]
+
+    # Segments and blocks, both ways.
+    node.sdo.download(0x2000, 0, LONG[:100], force_segment=True)
+    said["segments"] = node.sdo.upload(0x2000, 0) == LONG[:100]
+    write_blocks(node, LONG)
+    said["blocks"] = read_blocks(node) == LONG
+    # The nodes lose one segment each way, and the master sends it again or asks for it again.
+    node.sdo[0x2004].raw = 5
+    write_blocks(node, LONG[1:])
+    said["written_again"] = node.sdo.upload(0x2000, 0) == LONG[1:]
+    node.sdo[0x2004].raw = 7
+    said["read_again"] = read_blocks(node) == LONG[1:]
+
+    # States, PDOs, an emergency.
+    node.sdo[0x1017].raw = 100
+    node.nmt.wait_for_heartbeat(5)
+    node.nmt.state = "OPERATIONAL"
+    time.sleep(0.3)
+    said["state"] = node.nmt.state
+    node.tpdo.read()
+    node.rpdo.read()
+    node.rpdo[1]["Controlword"].raw = 0xF
+    node.rpdo[1]["Target speed"].raw = 500
+    node.rpdo[1].transmit()
+    time.sleep(0.5)
+    network.sync.transmit()
+    said["sync_pdo"] = node.tpdo[1].wait_for_reception(5) is not None
+    said["status"] = node.tpdo[1]["Statusword"].raw
+    said["timer_pdo"] = node.tpdo[2].wait_for_reception(5) is not None
+    said["speed"] = node.tpdo[2]["Speed"].raw
+    node.sdo[0x2003].raw = 0x4210
+    # It may be there before the write is confirmed.
+    until = time.monotonic() + 5
+    while not node.emcy.log and time.monotonic() < until:
+        time.sleep(0.05)
+    said["emergency"] = [node.emcy.log[-1].code, node.emcy.log[-1].register]
+
+    # The node that has no number.
+    network.lss.RESPONSE_TIMEOUT = 0.15
+    found, identity = network.lss.fast_scan()
+    said["found"], said["identity"] = found, list(identity)
+    network.lss.RESPONSE_TIMEOUT = 5.0
+    said["inquired"] = network.lss.inquire_lss_address(0x5D)
+    network.lss.configure_node_id(NEW_NODE)
+    network.lss.store_configuration()
+    other = network.add_node(NEW_NODE, sheet)
+    network.lss.send_switch_state_global(network.lss.WAITING_STATE)
+    other.nmt.wait_for_bootup(5)
+    other.sdo.RESPONSE_TIMEOUT = 5.0
+    said["other_serial"] = other.sdo[0x1018][4].raw
+
+    network.notifier.stop()
+    network.bus.shutdown()
+    print(json.dumps(said), flush=True)
+
+
+main(*sys.argv[1:])

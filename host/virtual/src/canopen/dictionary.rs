@@ -1,0 +1,176 @@
+//! A node's object dictionary, made of its sheet (CiA 306).
+
+use std::collections::BTreeMap;
+
+use cantap_protocols::canopen::eds::{self, Eds};
+
+/// Why a transfer is aborted (CiA 301, table 22).
+pub mod abort {
+    /// The toggle bit did not change.
+    pub const TOGGLE: u32 = 0x0503_0000;
+    /// The other side fell silent.
+    pub const TIMEOUT: u32 = 0x0504_0000;
+    /// There is no such command.
+    pub const COMMAND: u32 = 0x0504_0001;
+    /// A block of no frames, or of more than 127.
+    pub const BLOCK_SIZE: u32 = 0x0504_0002;
+    /// A frame's number.
+    pub const SEQUENCE: u32 = 0x0504_0003;
+    /// The CRC of a block transfer.
+    pub const CRC: u32 = 0x0504_0004;
+    /// More than there is room for.
+    pub const MEMORY: u32 = 0x0504_0005;
+    /// It can only be written.
+    pub const WRITE_ONLY: u32 = 0x0601_0001;
+    /// It can only be read.
+    pub const READ_ONLY: u32 = 0x0601_0002;
+    /// There is no such object.
+    pub const NO_OBJECT: u32 = 0x0602_0000;
+    /// It cannot be mapped.
+    pub const NOT_MAPPABLE: u32 = 0x0604_0041;
+    /// More than eight bytes are mapped.
+    pub const PDO_LENGTH: u32 = 0x0604_0042;
+    /// The length of the value.
+    pub const LENGTH: u32 = 0x0607_0010;
+    /// There is no such entry.
+    pub const NO_ENTRY: u32 = 0x0609_0011;
+    /// The value.
+    pub const VALUE: u32 = 0x0609_0030;
+    /// Not in this state.
+    pub const STATE: u32 = 0x0800_0022;
+}
+
+/// Longest value that is taken, in bytes.
+pub const MOST_BYTES: usize = 1 << 16;
+
+#[derive(Clone, Debug)]
+struct Entry {
+    /// Bytes of a value, unless it may have any number of them.
+    length: Option<usize>,
+    can_read: bool,
+    can_write: bool,
+    mappable: bool,
+    value: Vec<u8>,
+}
+
+/// Everything that the node has.
+#[derive(Clone, Debug, Default)]
+pub struct Dictionary {
+    entries: BTreeMap<(u16, u8), Entry>,
+}
+
+/// Bytes of a data type (CiA 301, table 44); `None` for texts and domains.
+const fn length(data_type: u16) -> Option<usize> {
+    Some(match data_type {
+        0x01 | 0x02 | 0x05 => 1,
+        0x03 | 0x06 => 2,
+        0x04 | 0x07 | 0x08 => 4,
+        0x11 | 0x15 | 0x1B => 8,
+        _ => return None,
+    })
+}
+
+impl Dictionary {
+    /// With the sheet's values for a node of this number.
+    pub fn new(sheet: &Eds, node: u8) -> Self {
+        let mut entries = BTreeMap::new();
+        for (&index, object) in &sheet.objects {
+            for (&sub, entry) in &object.entries {
+                let length = entry.data_type.and_then(length);
+                let value = match length {
+                    Some(length) => {
+                        let number = eds::number(&entry.value, node).unwrap_or(0);
+                        number.to_le_bytes()[..length].to_vec()
+                    }
+                    None => entry.value.clone().into_bytes(),
+                };
+                let access = entry.access.as_str();
+                let (can_read, can_write) = (access != "wo", access.starts_with("rw") || access == "wo");
+                let mappable = entry.mappable;
+                entries.insert((index, sub), Entry { length, can_read, can_write, mappable, value });
+            }
+        }
+        Self { entries }
+    }
+
+    fn entry(&self, index: u16, sub: u8) -> Result<&Entry, u32> {
+        let missing = || {
+            let known = self.entries.range((index, 0)..=(index, u8::MAX)).next().is_some();
+            if known { abort::NO_ENTRY } else { abort::NO_OBJECT }
+        };
+        self.entries.get(&(index, sub)).ok_or_else(missing)
+    }
+
+    /// What a client reads.
+    pub fn read(&self, index: u16, sub: u8) -> Result<&[u8], u32> {
+        let entry = self.entry(index, sub)?;
+        if entry.can_read { Ok(&entry.value) } else { Err(abort::WRITE_ONLY) }
+    }
+
+    /// Whether a client may write this many bytes, or any number where it does not say.
+    pub fn may_write(&self, index: u16, sub: u8, bytes: Option<usize>) -> Result<(), u32> {
+        let entry = self.entry(index, sub)?;
+        if !entry.can_write {
+            return Err(abort::READ_ONLY);
+        }
+        match (bytes, entry.length) {
+            (Some(bytes), Some(length)) if bytes != length => Err(abort::LENGTH),
+            (Some(bytes), _) if bytes > MOST_BYTES => Err(abort::MEMORY),
+            _ => Ok(()),
+        }
+    }
+
+    /// What a client writes.
+    pub fn write(&mut self, index: u16, sub: u8, value: &[u8]) -> Result<(), u32> {
+        self.may_write(index, sub, Some(value.len()))?;
+        let number = value.iter().take(4).rev().fold(0_u32, |number, byte| number << 8 | u32::from(*byte));
+        match (index, sub) {
+            // The history can only be cleared.
+            (0x1003, 0) if number != 0 => return Err(abort::VALUE),
+            (0x1600..=0x17FF | 0x1A00..=0x1BFF, 0) => self.check_mapping(index, number)?,
+            // CiA 301, 7.5.2.36: first no object is mapped, then others are, then so many.
+            (0x1600..=0x17FF | 0x1A00..=0x1BFF, 1..) if self.number(index, 0) != 0 => {
+                return Err(abort::STATE);
+            }
+            _ => {}
+        }
+        self.set(index, sub, value);
+        Ok(())
+    }
+
+    /// Whether the first `count` entries of a mapping can be sent or received.
+    fn check_mapping(&self, index: u16, count: u32) -> Result<(), u32> {
+        let mut bits = 0;
+        for sub in 1..=u8::try_from(count).map_err(|_| abort::VALUE)? {
+            let mapped = self.entry(index, sub).map_err(|_| abort::VALUE).map(|_| self.number(index, sub))?;
+            let (object, of) = ((mapped >> 16) as u16, (mapped >> 8) as u8);
+            // Below 20h it is a type: room that nothing is in.
+            if object >= 0x20 && !self.entry(object, of)?.mappable {
+                return Err(abort::NOT_MAPPABLE);
+            }
+            bits += mapped & 0xFF;
+        }
+        if bits > 64 { Err(abort::PDO_LENGTH) } else { Ok(()) }
+    }
+
+    /// The node's own value; what there is no entry for is left out.
+    pub fn set(&mut self, index: u16, sub: u8, value: &[u8]) {
+        if let Some(entry) = self.entries.get_mut(&(index, sub)) {
+            entry.value = value.to_vec();
+        }
+    }
+
+    /// A value as a number, 0 where there is none.
+    pub fn number(&self, index: u16, sub: u8) -> u32 {
+        let value = self.entries.get(&(index, sub)).map_or(&[][..], |entry| &entry.value);
+        value.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
+    }
+
+    /// The mapping of a PDO, in order: object, entry, bits.
+    pub fn mapping(&self, index: u16) -> impl Iterator<Item = (u16, u8, usize)> + '_ {
+        (1..=self.number(index, 0).min(64) as u8).map(move |sub| {
+            let mapped = self.number(index, sub);
+            ((mapped >> 16) as u16, (mapped >> 8) as u8, (mapped & 0xFF) as usize)
+        })
+    }
+}

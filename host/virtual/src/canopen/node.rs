@@ -1,0 +1,389 @@
+//! One node: its state, its heartbeat, its PDOs and emergencies, and the drive behind them.
+
+use std::collections::VecDeque;
+
+use cantap_protocols::canopen::eds::Eds;
+use cantap_wire::{Frame, Id};
+
+use super::dictionary::Dictionary;
+use super::lss::{Change, NO_NODE, Slave};
+use super::sdo::Server;
+
+const MS_NS: u64 = 1_000_000;
+/// The node takes this long to answer, and to boot.
+const THINKS_NS: u64 = 300_000;
+const BOOT_NS: u64 = 100 * MS_NS;
+/// The first heartbeat of a node that was there before anybody listened.
+const FIRST_BEAT_NS: u64 = 150 * MS_NS;
+/// Between two segments of a block.
+const SEGMENT_GAP_NS: u64 = 100_000;
+/// Frames that wait to be sent; more are not made, as a node whose bus is full makes none.
+const MOST_WAITING: usize = 512;
+/// How fast the drive's speed follows, in increments per second and second.
+const RAMP: i64 = 2000;
+/// What the drive does is worked out this often.
+const STEP_NS: u64 = 10 * MS_NS;
+
+const SYNC: u32 = 0x80;
+const LSS_MASTER: u32 = 0x7E5;
+const LSS_SLAVE: u32 = 0x7E4;
+
+/// States as heartbeats say them (CiA 301, table 31).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum State {
+    /// Without a number, or about to boot.
+    Silent,
+    Stopped,
+    Operational,
+    PreOperational,
+}
+
+impl State {
+    const fn code(self) -> u8 {
+        match self {
+            Self::Silent => 0,
+            Self::Stopped => 4,
+            Self::Operational => 5,
+            Self::PreOperational => 0x7F,
+        }
+    }
+}
+
+/// A node on the bus.
+#[derive(Debug)]
+pub struct CanOpenNode {
+    sheet: Eds,
+    serial: u32,
+    dictionary: Dictionary,
+    server: Server,
+    slave: Slave,
+    state: State,
+    boots_ns: Option<u64>,
+    beat_ns: u64,
+    toggle: bool,
+    /// When each TPDO with a timer is due, and how many SYNCs have passed since each was sent.
+    timers_ns: [u64; 2],
+    syncs: [u8; 2],
+    /// The drive's position times a thousand, and until when it was worked out.
+    position_milli: i64,
+    moved_ns: u64,
+    waiting: VecDeque<(u64, Frame)>,
+}
+
+fn frame(id: u32, bytes: &[u8]) -> Frame {
+    let mut data = [0; 8];
+    data[..bytes.len()].copy_from_slice(bytes);
+    Frame::from_bus(Id::standard_truncated(id), false, bytes.len() as u8, data)
+}
+
+impl CanOpenNode {
+    /// A node of this number, or without one ([`NO_NODE`]), that has booted before.
+    pub fn new(sheet: &Eds, node: u8, serial: u32) -> Self {
+        let mut made = Self {
+            sheet: sheet.clone(),
+            serial,
+            dictionary: Dictionary::default(),
+            server: Server::default(),
+            slave: Slave::new([0; 4], node),
+            state: if node == NO_NODE { State::Silent } else { State::PreOperational },
+            boots_ns: None,
+            beat_ns: FIRST_BEAT_NS,
+            toggle: false,
+            timers_ns: [0; 2],
+            syncs: [0; 2],
+            position_milli: 0,
+            moved_ns: 0,
+            waiting: VecDeque::new(),
+        };
+        made.load();
+        let identity = [1, 2, 3, 4].map(|sub| made.dictionary.number(0x1018, sub));
+        made.slave = Slave::new(identity, node);
+        made
+    }
+
+    /// Everything as the sheet has it.
+    fn load(&mut self) {
+        self.dictionary = Dictionary::new(&self.sheet, self.slave.node);
+        self.dictionary.set(0x1018, 4, &self.serial.to_le_bytes());
+        self.server = Server::default();
+        (self.position_milli, self.syncs) = (0, [0; 2]);
+    }
+
+    fn node(&self) -> u32 {
+        self.slave.node.into()
+    }
+
+    fn send(&mut self, at_ns: u64, frame: Frame) {
+        if self.waiting.len() < MOST_WAITING {
+            let after = self.waiting.back().map_or(0, |(due_ns, _)| *due_ns);
+            self.waiting.push_back((at_ns.max(after), frame));
+        }
+    }
+
+    /// Sent again as soon as the bus is free.
+    pub fn send_again(&mut self, frame: Frame) {
+        self.waiting.push_front((0, frame));
+    }
+
+    /// The frame that is to be sent next, and from when on.
+    pub fn wish(&self) -> Option<(u64, Frame)> {
+        self.waiting.front().copied()
+    }
+
+    /// It is on the bus.
+    pub fn sent(&mut self) {
+        self.waiting.pop_front();
+    }
+
+    /// When the node next does something by itself.
+    pub fn due(&self) -> u64 {
+        let mut due_ns = self.boots_ns.unwrap_or(u64::MAX);
+        due_ns = due_ns.min(self.server.due().unwrap_or(u64::MAX));
+        if self.state != State::Silent && self.beat_period_ns() > 0 {
+            due_ns = due_ns.min(self.beat_ns);
+        }
+        for (place, at_ns) in self.timers_ns.iter().enumerate() {
+            if self.timer_ns(place).is_some() {
+                due_ns = due_ns.min(*at_ns);
+            }
+        }
+        due_ns.min(self.wish().map_or(u64::MAX, |(at_ns, _)| at_ns))
+    }
+
+    fn beat_period_ns(&self) -> u64 {
+        u64::from(self.dictionary.number(0x1017, 0)) * MS_NS
+    }
+
+    /// How often a TPDO is sent by its timer.
+    fn timer_ns(&self, place: usize) -> Option<u64> {
+        let parameter = 0x1800 + place as u16;
+        let period_ns = u64::from(self.dictionary.number(parameter, 5)) * MS_NS;
+        let by_timer = self.dictionary.number(parameter, 2) >= 254;
+        (self.state == State::Operational && by_timer && period_ns > 0).then_some(period_ns)
+    }
+
+    /// Does what is due.
+    pub fn advance(&mut self, now_ns: u64) {
+        if self.boots_ns.is_some_and(|at_ns| at_ns <= now_ns) {
+            self.boots_ns = None;
+            self.send(now_ns, frame(0x700 + self.node(), &[0]));
+            self.enter(State::PreOperational, now_ns);
+            self.beat_ns = now_ns + self.beat_period_ns();
+        }
+        if self.server.due().is_some_and(|due_ns| due_ns <= now_ns) {
+            let abort = self.server.give_up();
+            self.send(now_ns, frame(0x580 + self.node(), &abort));
+        }
+        let period_ns = self.beat_period_ns();
+        if self.state != State::Silent && period_ns > 0 && self.beat_ns <= now_ns {
+            self.send(now_ns, frame(0x700 + self.node(), &[self.state.code()]));
+            // Those whose time passed while the bus was busy are left out.
+            self.beat_ns += period_ns * ((now_ns - self.beat_ns) / period_ns + 1);
+        }
+        self.drive(now_ns);
+        for place in 0..self.timers_ns.len() {
+            if let Some(period_ns) = self.timer_ns(place)
+                && self.timers_ns[place] <= now_ns
+            {
+                self.send_pdo(place, now_ns);
+                self.timers_ns[place] = now_ns + period_ns;
+            }
+        }
+    }
+
+    fn enter(&mut self, state: State, now_ns: u64) {
+        if state == State::Operational && self.state != state {
+            self.timers_ns = [now_ns + MS_NS; 2];
+            self.moved_ns = now_ns;
+        }
+        self.state = state;
+    }
+
+    /// The speed follows its target, and the position the speed.
+    fn drive(&mut self, now_ns: u64) {
+        if self.state != State::Operational {
+            self.moved_ns = now_ns;
+            return;
+        }
+        while self.moved_ns + STEP_NS <= now_ns {
+            // Not worth working out in steps what nobody has seen.
+            if now_ns - self.moved_ns > 1000 * STEP_NS {
+                self.moved_ns = now_ns - 1000 * STEP_NS;
+            }
+            self.moved_ns += STEP_NS;
+            let is_on = self.dictionary.number(0x6041, 0) == 0x0237;
+            let target = if is_on { i64::from(self.dictionary.number(0x2001, 0) as i32) } else { 0 };
+            let speed = i64::from(self.dictionary.number(0x2002, 0) as i32);
+            let step_ms = (STEP_NS / MS_NS) as i64;
+            let most = RAMP * step_ms / 1000;
+            let speed = speed + (target - speed).clamp(-most, most);
+            self.position_milli += speed * step_ms;
+            self.dictionary.set(0x2002, 0, &(speed as i32).to_le_bytes());
+            self.dictionary.set(0x6064, 0, &((self.position_milli / 1000) as i32).to_le_bytes());
+        }
+    }
+
+    /// The controlword's first four bits (CiA 402, state machine), as far as this drive has them.
+    fn control(&mut self) {
+        let status: u16 = match self.dictionary.number(0x6040, 0) & 0xF {
+            0x6 => 0x0231,
+            0x7 => 0x0233,
+            0xF => 0x0237,
+            _ => 0x0250,
+        };
+        self.dictionary.set(0x6041, 0, &status.to_le_bytes());
+    }
+
+    fn send_pdo(&mut self, place: usize, now_ns: u64) {
+        let id = self.dictionary.number(0x1800 + place as u16, 1);
+        // Bit 31: it does not exist.
+        if id & 0x8000_0000 != 0 || self.state != State::Operational {
+            return;
+        }
+        let (mut bits, mut filled) = (0_u64, 0);
+        for (index, sub, length) in self.dictionary.mapping(0x1A00 + place as u16) {
+            let value = u64::from(self.dictionary.number(index, sub));
+            let kept = if length >= 64 { value } else { value & ((1 << length) - 1) };
+            bits |= kept.checked_shl(filled as u32).unwrap_or(0);
+            filled += length;
+        }
+        let bytes = &bits.to_le_bytes()[..filled.min(64).div_ceil(8)];
+        self.send(now_ns, frame(id & 0x7FF, bytes));
+    }
+
+    fn take_pdo(&mut self, data: &[u8], now_ns: u64) {
+        let mapping: Vec<_> = self.dictionary.mapping(0x1600).collect();
+        let needed: usize = mapping.iter().map(|(.., length)| length).sum();
+        if data.len() * 8 < needed {
+            self.emergency(0x8210, now_ns);
+            return;
+        }
+        let all = data.iter().rev().fold(0_u64, |bits, byte| bits << 8 | u64::from(*byte));
+        let mut at = 0;
+        for (index, sub, length) in mapping {
+            let value = all.checked_shr(at as u32).unwrap_or(0);
+            at += length;
+            self.dictionary.set(index, sub, &value.to_le_bytes()[..length.div_ceil(8).min(8)]);
+        }
+        self.control();
+    }
+
+    /// Code 0: there is no error any more.
+    fn emergency(&mut self, code: u16, now_ns: u64) {
+        let register = u8::from(code != 0);
+        self.dictionary.set(0x1001, 0, &[register]);
+        if code != 0 {
+            self.dictionary.set(0x1003, 0, &[1]);
+            self.dictionary.set(0x1003, 1, &u32::from(code).to_le_bytes());
+        }
+        let [low, high] = code.to_le_bytes();
+        let id = self.dictionary.number(0x1014, 0) & 0x7FF;
+        self.send(now_ns, frame(id, &[low, high, register, 0, 0, 0, 0, 0]));
+    }
+
+    /// Takes a frame of the bus.
+    pub fn hear(&mut self, heard: &Frame, now_ns: u64) {
+        if heard.id().is_extended() {
+            return;
+        }
+        let (id, node, at_ns) = (heard.id().raw(), self.node(), now_ns + THINKS_NS);
+        if heard.is_remote() {
+            // Guarding, where there is no heartbeat.
+            if id == 0x700 + node && self.state != State::Silent && self.beat_period_ns() == 0 {
+                let said = self.state.code() | u8::from(self.toggle) << 7;
+                self.toggle = !self.toggle;
+                self.send(at_ns, frame(id, &[said]));
+            }
+            return;
+        }
+        let data = heard.data();
+        if id == LSS_MASTER {
+            if let Ok(bytes) = data.try_into() {
+                let (said, change) = self.slave.take(bytes);
+                if let Some(bytes) = said {
+                    self.send(at_ns, frame(LSS_SLAVE, &bytes));
+                }
+                if change == Some(Change::Node) {
+                    self.load();
+                    self.boots_ns = Some(now_ns + BOOT_NS);
+                }
+            }
+            return;
+        }
+        if self.slave.node == NO_NODE || self.boots_ns.is_some() {
+            return;
+        }
+        match id {
+            0 => {
+                if let &[command, to] = data
+                    && (to == 0 || u32::from(to) == node)
+                {
+                    self.manage(command, now_ns);
+                }
+            }
+            SYNC if self.state == State::Operational => self.synchronise(now_ns),
+            _ if id == 0x600 + node && matches!(self.state, State::PreOperational | State::Operational) => {
+                let Ok(bytes) = data.try_into() else { return };
+                self.drive(now_ns);
+                let said = self.server.take(bytes, &mut self.dictionary, now_ns);
+                let mut at_ns = at_ns;
+                for bytes in said.frames {
+                    self.send(at_ns, frame(0x580 + node, &bytes));
+                    at_ns += SEGMENT_GAP_NS;
+                }
+                if let Some(object) = said.written {
+                    self.written(object, now_ns);
+                }
+            }
+            _ if self.state == State::Operational
+                && self.dictionary.number(0x1400, 1) & 0x8000_07FF == id =>
+            {
+                self.take_pdo(data, now_ns);
+            }
+            _ => {}
+        }
+    }
+
+    fn manage(&mut self, command: u8, now_ns: u64) {
+        match command {
+            1 => self.enter(State::Operational, now_ns),
+            2 => self.enter(State::Stopped, now_ns),
+            0x80 => self.enter(State::PreOperational, now_ns),
+            0x81 | 0x82 => {
+                self.slave.reset();
+                self.load();
+                (self.state, self.toggle) = (State::Silent, false);
+                self.boots_ns = (self.slave.node != NO_NODE).then_some(now_ns + BOOT_NS);
+            }
+            _ => {}
+        }
+    }
+
+    fn synchronise(&mut self, now_ns: u64) {
+        self.drive(now_ns);
+        for place in 0..self.syncs.len() {
+            let every = self.dictionary.number(0x1800 + place as u16, 2) as u8;
+            if !(1..=240).contains(&every) {
+                continue;
+            }
+            self.syncs[place] += 1;
+            if self.syncs[place] >= every {
+                self.syncs[place] = 0;
+                self.send_pdo(place, now_ns + THINKS_NS);
+            }
+        }
+    }
+
+    /// A client has written an object: what that does.
+    fn written(&mut self, object: (u16, u8), now_ns: u64) {
+        match object {
+            (0x1003, 0) => self.dictionary.set(0x1003, 1, &[0; 4]),
+            (0x1017, 0) => self.beat_ns = now_ns + self.beat_period_ns(),
+            (0x1800 | 0x1801, 5) => self.timers_ns = [now_ns; 2],
+            (0x2003, 0) => self.emergency(self.dictionary.number(0x2003, 0) as u16, now_ns),
+            (0x2004, 0) => self.server.loses = self.dictionary.number(0x2004, 0) as u8,
+            (0x6040, 0) => self.control(),
+            _ => {}
+        }
+    }
+}

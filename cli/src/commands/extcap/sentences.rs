@@ -38,7 +38,9 @@ pub fn interfaces(places: &[Place]) -> String {
     }
     value(Control::Mode, "", "as opened", true);
     for (mode, shown) in MODES {
-        value(Control::Mode, mode, shown, false);
+        // What makes this control wide is taken from load and losses, which are then cut: "1: 30 %" showed as "0 %".
+        let short = shown.split(':').next().unwrap_or(shown);
+        value(Control::Mode, mode, short, false);
     }
     out
 }

@@ -244,7 +244,9 @@ fn with_one_byte_of_a_binary_file_changed_no_record_is_lost_without_being_told()
         let path = directory.path().join("whole");
         let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
         let mut writer = create_writer(&path, &options).unwrap();
-        records.iter().for_each(|record| writer.write(record).unwrap());
+        for record in records {
+            writer.write(record).unwrap();
+        }
         writer.finish().unwrap();
         let whole = std::fs::read(&path).unwrap();
         let found = |bytes: Vec<u8>| {

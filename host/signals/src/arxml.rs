@@ -435,14 +435,14 @@ impl<'a> Reader<'a> {
         if let Some(base_type) = find("BASE-TYPE-REF") {
             let encoding =
                 within(base_type, "BASE-TYPE-ENCODING").next().map(|node| xml::text(node).trim().to_owned());
-            signal.kind = kind(encoding.as_deref().unwrap_or_default(), length)?;
+            signal.kind = kind(encoding.as_deref().unwrap_or_default(), length);
         } else if let Some(data_type) = data_type {
             let encoding = within(data_type, "ENCODING").next().map(|node| xml::text(node).trim().to_owned());
             let encoding = match (data_type.tag_name().name(), encoding.as_deref()) {
                 ("REAL-TYPE", _) | (_, Some("SINGLE" | "DOUBLE")) => "IEEE754",
                 _ => "NONE",
             };
-            signal.kind = kind(encoding, length)?;
+            signal.kind = kind(encoding, length);
         }
         let method = find("COMPU-METHOD-REF");
         if let Some(method) = method {
@@ -462,8 +462,8 @@ impl<'a> Reader<'a> {
 }
 
 /// What the name of an encoding means.
-fn kind(encoding: &str, length: u16) -> Result<ValueKind, FaultKind> {
-    Ok(match (encoding, length) {
+fn kind(encoding: &str, length: u16) -> ValueKind {
+    match (encoding, length) {
         ("2C", _) => ValueKind::Signed,
         ("SM", _) => ValueKind::SignMagnitude,
         ("1C", _) => ValueKind::OnesComplement,
@@ -471,7 +471,7 @@ fn kind(encoding: &str, length: u16) -> Result<ValueKind, FaultKind> {
         ("IEEE754", ..=32) => ValueKind::Single,
         ("IEEE754", _) => ValueKind::Double,
         _ => ValueKind::Unsigned,
-    })
+    }
 }
 
 /// The first cyclic timing of a PDU.

@@ -61,7 +61,8 @@ impl Whole {
         let block = self.any_block(at)?;
         let least = LEAST_LINKS.iter().find(|(of, _)| **of == name).map_or(0, |(_, least)| *least);
         if block.name == name && block.links.len() < least {
-            let expected = format!("{least} links in the block {} at {at:#x}", String::from_utf8_lossy(&name));
+            let expected =
+                format!("{least} links in the block {} at {at:#x}", String::from_utf8_lossy(&name));
             Err(Fault::malformed(expected, block.links.len().to_string().as_bytes()))
         } else if block.name == name {
             Ok(block)

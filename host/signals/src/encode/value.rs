@@ -108,9 +108,8 @@ fn range_error(signal: &Signal, value: String) -> EncodeError {
     let mask = layout::mask(signal.length);
     let (low, high) = match signal.kind {
         ValueKind::Unsigned => (0, mask),
-        ValueKind::Signed => (mask / 2 + 1, mask / 2),
+        ValueKind::Signed | ValueKind::OnesComplement => (mask / 2 + 1, mask / 2),
         ValueKind::SignMagnitude => (mask, mask / 2),
-        ValueKind::OnesComplement => (mask / 2 + 1, mask / 2),
         ValueKind::Half => (0xFBFF, 0x7BFF),
         ValueKind::Single => (u64::from(f32::MIN.to_bits()) >> (32 - signal.length.min(32)), {
             u64::from(f32::MAX.to_bits()) >> (32 - signal.length.min(32))

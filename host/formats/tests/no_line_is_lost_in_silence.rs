@@ -234,6 +234,48 @@ fn with_one_byte_changed_in_every_row_of_a_table_each_is_a_record_or_an_issue() 
     assert!(counts[0] > LINES / 20, "{counts:?}");
 }
 
+/// Not all that changes can be noticed, but what is not there any more.
+#[test]
+fn with_one_byte_of_a_binary_file_changed_no_record_is_lost_without_being_told() {
+    const RECORDS: usize = 200;
+    let records = &records(true)[..RECORDS];
+    for format in [Format::Blf, Format::Pcapng, Format::Mf4] {
+        let directory = tempfile::tempdir().unwrap();
+        let path = directory.path().join("whole");
+        let options = WriteOptions { format: Some(format), ..WriteOptions::default() };
+        let mut writer = create_writer(&path, &options).unwrap();
+        for record in records {
+            writer.write(record).unwrap();
+        }
+        writer.finish().unwrap();
+        let whole = std::fs::read(&path).unwrap();
+        let found = |bytes: Vec<u8>| {
+            let source = Cursor::new(bytes);
+            let reader = TraceReader::from_source("damaged", source, format, &ReadOptions::default());
+            let mut reader = reader.unwrap();
+            let issues = reader.by_ref().filter(Result::is_err).count() as u64;
+            (reader.records(), issues + reader.left_out().total() + reader.notes().total())
+        };
+        assert_eq!(found(whole.clone()), (RECORDS as u64, 0), "{format}");
+        let mut random = fastrand::Rng::with_seed(3);
+        let mut told = 0;
+        for turn in 0..6000 {
+            let mut damaged = whole.clone();
+            // What describes the file is short, and has its turn too.
+            let at = random.usize(..if turn % 2 == 0 { whole.len() } else { whole.len().min(2000) });
+            damaged[at] ^= random.u8(1..);
+            let (at_value, (records, words)) = (damaged[at], found(damaged));
+            assert!(
+                records >= RECORDS as u64 || words > 0,
+                "{format}: {records} with {at_value:#x} for {:#x} at {at:#x}",
+                whole[at]
+            );
+            told += u64::from(words > 0);
+        }
+        assert!(told > 100, "{format}: {told}");
+    }
+}
+
 fn is_row(format: Format, line: &[u8]) -> bool {
     let text = line.trim_ascii_start();
     match format {

@@ -1,7 +1,7 @@
 //! Databases from ARXML files, AUTOSAR's system descriptions of version 3 and 4.
 //!
 //! A frame's identifier stands where a CAN channel sends it, its signals in the PDUs that are mapped into it, and how their bits become
-//! values in yet other places, named by paths. Of a secured PDU the payload is read, which stands in front of its authenticator. What a
+//! values in yet other places, named by paths. Of a secured PDU the payload is read, and what follows it: freshness value and authenticator. What a
 //! container PDU holds says each frame anew, so it is not read: its frames keep what else is in them, with a warning.
 
 use std::collections::{HashMap, HashSet};
@@ -86,7 +86,23 @@ fn content(node: Node<'_, '_>, name: &str) -> Option<String> {
 }
 
 fn number(node: Node<'_, '_>, name: &str) -> Option<i64> {
-    content(node, name).and_then(|text| xml::integer(&text)).and_then(|value| i64::try_from(value).ok())
+    content(node, name).and_then(|text| integer(&text)).and_then(|value| i64::try_from(value).ok())
+}
+
+/// As AUTOSAR writes integers: a zero in front makes them octal.
+fn integer(text: &str) -> Option<i128> {
+    let text = text.trim();
+    let (sign, digits) = text.strip_prefix('-').map_or((1, text), |digits| (-1, digits));
+    let octal = digits.strip_prefix('0').filter(|rest| !rest.is_empty());
+    match octal.and_then(|digits| i128::from_str_radix(digits, 8).ok()) {
+        Some(magnitude) => Some(sign * magnitude),
+        None => xml::integer(text),
+    }
+}
+
+/// An integer or a floating-point number.
+fn real(text: &str) -> Option<f64> {
+    integer(text).map(|value| value as f64).or_else(|| text.trim().parse().ok())
 }
 
 fn short_name(node: Node<'_, '_>) -> String {
@@ -293,10 +309,48 @@ impl<'a> Reader<'a> {
         let triggering = self.reference(pdu, "PAYLOAD-REF");
         let payload = triggering.and_then(|node| self.reference(node, "I-PDU-REF"));
         if let Some(payload) = payload {
-            return self.pdu(payload, target);
+            self.pdu(payload, target)?;
+            self.proof(pdu, payload, target);
+            return Ok(());
         }
         self.warn(pdu, target.name, &format!("the payload of {name}, a secured PDU, is not in the file"));
         Ok(())
+    }
+
+    /// The freshness value and the authenticator that follow a payload, as far as a frame carries them. They have no names in the
+    /// file; these are what cantools calls them.
+    fn proof(&mut self, pdu: Node<'a, 'a>, payload: Node<'a, 'a>, target: &mut Target) {
+        let parts = [
+            ("Freshness", "FRESHNESS-PROPS-REF", "FRESHNESS-VALUE-TX-LENGTH"),
+            ("Authenticator", "AUTHENTICATION-PROPS-REF", "AUTH-INFO-TX-LENGTH"),
+        ];
+        let mut at = number(payload, "LENGTH").and_then(|bytes| u16::try_from(bytes).ok()?.checked_mul(8));
+        for (name, props, bits) in parts {
+            let Some(length) = self.reference(pdu, props).and_then(|props| number(props, bits)) else {
+                continue;
+            };
+            let length = match u16::try_from(length) {
+                Ok(0) => continue,
+                Ok(length) => length,
+                Err(_) => u16::MAX,
+            };
+            let place =
+                at.and_then(|at| at.checked_add(target.offset)).filter(|at| *at < validate::MAX_BYTES * 8);
+            let Some(first) = place.filter(|_| length <= 64) else {
+                let reason =
+                    format!("the {} of {}, {length} bits, is not read", name.to_lowercase(), short_name(pdu));
+                self.warn(pdu, target.name, &reason);
+                at = at.and_then(|at| at.checked_add(length));
+                continue;
+            };
+            target.signals.push(Signal {
+                order: ByteOrder::Big,
+                line: self.line(pdu),
+                // The most significant bit comes first.
+                ..Signal::new(format!("{}_{name}", target.name), first / 8 * 8 + 7 - first % 8, length)
+            });
+            at = at.and_then(|at| at.checked_add(length));
+        }
     }
 
     /// A PDU whose selector says which of several others is in it.
@@ -381,14 +435,14 @@ impl<'a> Reader<'a> {
         if let Some(base_type) = find("BASE-TYPE-REF") {
             let encoding =
                 within(base_type, "BASE-TYPE-ENCODING").next().map(|node| xml::text(node).trim().to_owned());
-            signal.kind = kind(encoding.as_deref().unwrap_or_default(), length)?;
+            signal.kind = kind(encoding.as_deref().unwrap_or_default(), length);
         } else if let Some(data_type) = data_type {
             let encoding = within(data_type, "ENCODING").next().map(|node| xml::text(node).trim().to_owned());
             let encoding = match (data_type.tag_name().name(), encoding.as_deref()) {
                 ("REAL-TYPE", _) | (_, Some("SINGLE" | "DOUBLE")) => "IEEE754",
                 _ => "NONE",
             };
-            signal.kind = kind(encoding, length)?;
+            signal.kind = kind(encoding, length);
         }
         let method = find("COMPU-METHOD-REF");
         if let Some(method) = method {
@@ -400,7 +454,7 @@ impl<'a> Reader<'a> {
         }
         let initial = i_signal.children().find(|child| child.tag_name().name() == "INIT-VALUE");
         let initial = initial.and_then(|initial| within(initial, "VALUE").next()).map(xml::text);
-        if let Some(initial) = initial.and_then(|text| xml::integer(&text)) {
+        if let Some(initial) = initial.and_then(|text| integer(&text)) {
             signal.initial_raw = initial as u64 & layout::mask(length);
         }
         Ok(signal)
@@ -408,18 +462,16 @@ impl<'a> Reader<'a> {
 }
 
 /// What the name of an encoding means.
-fn kind(encoding: &str, length: u16) -> Result<ValueKind, FaultKind> {
-    Ok(match (encoding, length) {
+fn kind(encoding: &str, length: u16) -> ValueKind {
+    match (encoding, length) {
         ("2C", _) => ValueKind::Signed,
         ("SM", _) => ValueKind::SignMagnitude,
-        ("1C", _) => {
-            return Err(FaultKind::Syntax("numbers in one's complement (1C) are not read".to_owned()));
-        }
+        ("1C", _) => ValueKind::OnesComplement,
         ("IEEE754", 16) => ValueKind::Half,
         ("IEEE754", ..=32) => ValueKind::Single,
         ("IEEE754", _) => ValueKind::Double,
         _ => ValueKind::Unsigned,
-    })
+    }
 }
 
 /// The first cyclic timing of a PDU.
@@ -439,7 +491,7 @@ fn compute(method: Node<'_, '_>, signal: &mut Signal) -> Result<(), FaultKind> {
     let mut line: Option<(f64, f64)> = None;
     let mut limits: Option<(f64, f64)> = None;
     for scale in method.descendants().filter(is_scale) {
-        let limit = |name: &str| content(scale, name).and_then(|text| text.parse::<f64>().ok());
+        let limit = |name: &str| content(scale, name).and_then(|text| real(&text));
         let (low, high) = (limit("LOWER-LIMIT"), limit("UPPER-LIMIT"));
         let named = |name: &'static str| scale.descendants().find(move |node| node.tag_name().name() == name);
         if let Some(text) = named("VT") {
@@ -457,7 +509,7 @@ fn compute(method: Node<'_, '_>, signal: &mut Signal) -> Result<(), FaultKind> {
             let parent = named(name).into_iter();
             let all =
                 parent.flat_map(|parent| parent.children().filter(|node| node.tag_name().name() == "V"));
-            all.filter_map(|node| xml::text(node).trim().parse().ok()).collect()
+            all.filter_map(|node| real(&xml::text(node))).collect()
         };
         let (numerator, denominator) = (values("COMPU-NUMERATOR"), values("COMPU-DENOMINATOR"));
         if numerator.is_empty() && denominator.is_empty() {

@@ -109,6 +109,8 @@ pub enum ValueKind {
     Signed,
     /// A sign bit, then the magnitude: 0xC040 in 16 bits is −0x4040.
     SignMagnitude,
+    /// An integer in one's complement: negative ones have all bits of their magnitude inverted, and there are two zeros.
+    OnesComplement,
     /// IEEE 754 half precision, 16 bits.
     Half,
     /// IEEE 754 single precision. Fewer than 32 bits are its upper bits, the rest being zero.
@@ -310,6 +312,10 @@ impl Signal {
                 let magnitude = i128::from(raw & layout::mask(self.length) >> 1);
                 Some(if raw >> (self.length - 1) & 1 == 1 { -magnitude } else { magnitude })
             }
+            ValueKind::OnesComplement => {
+                let is_negative = raw >> (self.length - 1) & 1 == 1;
+                Some(if is_negative { -i128::from(!raw & layout::mask(self.length)) } else { raw.into() })
+            }
             ValueKind::Half | ValueKind::Single | ValueKind::Double => None,
         }
     }
@@ -319,7 +325,7 @@ impl Signal {
         let length = u32::from(self.length);
         match self.kind {
             ValueKind::Unsigned => raw as f64,
-            ValueKind::Signed | ValueKind::SignMagnitude => {
+            ValueKind::Signed | ValueKind::SignMagnitude | ValueKind::OnesComplement => {
                 self.integer(raw).map_or(f64::NAN, |value| value as f64)
             }
             ValueKind::Half => half::f16::from_bits(raw as u16).to_f64(),
@@ -337,9 +343,10 @@ impl Signal {
     /// How raw values become physical ones.
     pub(super) fn scale(&self) -> Scale {
         match self.kind {
-            ValueKind::Unsigned | ValueKind::Signed | ValueKind::SignMagnitude => {
-                Scale::of(self.factor, self.offset)
-            }
+            ValueKind::Unsigned
+            | ValueKind::Signed
+            | ValueKind::SignMagnitude
+            | ValueKind::OnesComplement => Scale::of(self.factor, self.offset),
             ValueKind::Half | ValueKind::Single | ValueKind::Double => Scale::plain(self.factor, self.offset),
         }
     }
@@ -387,6 +394,14 @@ mod tests {
         let signal = Signal { kind: ValueKind::SignMagnitude, ..Signal::new("S", 0, 16) };
         assert_eq!(signal.number(0xC040), Number::Integer(-0x4040));
         assert_eq!(signal.number(0x4040), Number::Integer(0x4040));
+    }
+
+    #[test]
+    fn ones_complement_has_two_zeros() {
+        let signal = Signal { kind: ValueKind::OnesComplement, ..Signal::new("S", 0, 8) };
+        for (raw, value) in [(0, 0), (0x7F, 127), (0x80, -127), (0xFE, -1), (0xFF, 0)] {
+            assert_eq!(signal.number(raw), Number::Integer(value), "{raw:#x}");
+        }
     }
 
     /// The "Float" of the earlier analyser: fewer bits are the upper ones.

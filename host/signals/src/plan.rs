@@ -137,7 +137,10 @@ impl MessagePlan {
                 ValueKind::Signed => Conversion::Signed(unused),
                 ValueKind::Single if signal.length <= 32 => Conversion::Single(unused - 32),
                 ValueKind::Double => Conversion::Double(unused),
-                ValueKind::Half | ValueKind::Single | ValueKind::SignMagnitude => Conversion::Other,
+                ValueKind::Half
+                | ValueKind::Single
+                | ValueKind::SignMagnitude
+                | ValueKind::OnesComplement => Conversion::Other,
             };
             let (scale, indicates) = (signal.scale(), message.j1939);
             let plan = SignalPlan { field, conversion, index: index as u32, scale, indicates };

@@ -131,7 +131,11 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
         let length_fits = match signal.kind {
             ValueKind::Half => signal.length == 16,
             ValueKind::Single => signal.length <= 32,
-            ValueKind::Unsigned | ValueKind::Signed | ValueKind::SignMagnitude | ValueKind::Double => true,
+            ValueKind::Unsigned
+            | ValueKind::Signed
+            | ValueKind::SignMagnitude
+            | ValueKind::OnesComplement
+            | ValueKind::Double => true,
         };
         if !length_fits {
             report(signal, FaultKind::FloatLength(signal.length));

@@ -149,6 +149,50 @@ fn an_arxml_file_is_read() {
     assert_eq!(arxml::parse("x.arxml", &wide).unwrap().messages[0].signals[0].unit, "°C");
 }
 
+/// A zero in front makes a number octal in AUTOSAR: lengths and identifiers were read as decimal ones.
+#[test]
+fn an_arxml_files_numbers_may_be_octal_or_hexadecimal_and_in_ones_complement() {
+    let text = ARXML
+        .replace("<IDENTIFIER>291<", "<IDENTIFIER>0443<")
+        .replace("<LENGTH>16<", "<LENGTH>020<")
+        .replace("-LIMIT>850<", "-LIMIT>0x352<")
+        .replace("-LIMIT>-400<", "-LIMIT>-0620<");
+    let same = arxml::parse("x.arxml", ARXML.as_bytes()).unwrap();
+    assert_eq!(arxml::parse("x.arxml", text.as_bytes()).unwrap().messages, same.messages);
+    let database = arxml::parse("x.arxml", ARXML.replace(">2C<", ">1C<").as_bytes()).unwrap();
+    assert_eq!(decode(database, "00000123#00FFF6"), "Sig=-0.4°C");
+}
+
+#[test]
+fn what_follows_the_payload_of_a_secured_pdu_is_read_as_far_as_it_fits_a_signal() {
+    let with_proof = |freshness: u32, authenticator: u32| {
+        let secured = format!(
+            "<SECURED-I-PDU><SHORT-NAME>Safe</SHORT-NAME><PAYLOAD-REF>/P/C/Tr</PAYLOAD-REF>
+              <FRESHNESS-PROPS-REF>/P/Fresh</FRESHNESS-PROPS-REF><AUTHENTICATION-PROPS-REF>/P/Auth</AUTHENTICATION-PROPS-REF></SECURED-I-PDU>
+             <SECURE-COMMUNICATION-FRESHNESS-PROPS><SHORT-NAME>Fresh</SHORT-NAME><FRESHNESS-VALUE-TX-LENGTH>{freshness}</FRESHNESS-VALUE-TX-LENGTH>
+             </SECURE-COMMUNICATION-FRESHNESS-PROPS><SECURE-COMMUNICATION-AUTHENTICATION-PROPS><SHORT-NAME>Auth</SHORT-NAME>
+              <AUTH-INFO-TX-LENGTH>{authenticator}</AUTH-INFO-TX-LENGTH></SECURE-COMMUNICATION-AUTHENTICATION-PROPS>
+             <I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME><LENGTH>2</LENGTH>"
+        );
+        let text = ARXML
+            .replace("<FRAME-LENGTH>3<", "<FRAME-LENGTH>20<")
+            .replace("<PDU-REF>/P/Pdu</PDU-REF>", "<PDU-REF>/P/Safe</PDU-REF>")
+            .replace("<I-SIGNAL-I-PDU><SHORT-NAME>Pdu</SHORT-NAME>", &secured)
+            .replace("<X><CAN-FRAME-TRIGGERING>", "<X><PDU-TRIGGERING><SHORT-NAME>Tr</SHORT-NAME><I-PDU-REF>/P/Pdu</I-PDU-REF></PDU-TRIGGERING><CAN-FRAME-TRIGGERING>");
+        arxml::parse("x.arxml", text.as_bytes()).unwrap()
+    };
+    // Behind three bytes: 4 bits, then 12.
+    let database = with_proof(4, 12);
+    assert_eq!(decode(database, "00000123#00FFF6A5C3"), "Sig=-0.5°C F_Freshness=10 F_Authenticator=1475");
+    let database = with_proof(0, 128);
+    assert_eq!(database.messages[0].signals.len(), 1);
+    let warnings: Vec<_> = database.warnings.iter().map(ToString::to_string).collect();
+    assert!(
+        warnings.iter().any(|warning| warning.contains("the authenticator of Safe, 128 bits, is not read")),
+        "{warnings:?}"
+    );
+}
+
 #[test]
 fn the_payload_of_a_secured_pdu_is_read_and_of_a_container_it_is_said_that_it_is_not() {
     let secured = |more: &str| {

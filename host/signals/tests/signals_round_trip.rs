@@ -21,7 +21,7 @@ prop_compose! {
     fn signal()(
         big: bool,
         kind in prop::sample::select(vec![
-            ValueKind::Unsigned, ValueKind::Signed, ValueKind::SignMagnitude, ValueKind::Half, ValueKind::Single, ValueKind::Double,
+            ValueKind::Unsigned, ValueKind::Signed, ValueKind::SignMagnitude, ValueKind::OnesComplement, ValueKind::Half, ValueKind::Single, ValueKind::Double,
         ]),
         start in 0u16..64,
         length in 1u16..=64,
@@ -59,7 +59,10 @@ proptest! {
         decoder.decode(1, &encoded.frame.into(), &mut values).unwrap();
         prop_assert_eq!(signal.number(values[0].raw), number);
         // Minus zero and zero are the same number.
-        let only_the_sign = raw == 1 << (signal.length - 1);
+        let only_the_sign = match signal.kind {
+            ValueKind::OnesComplement => raw == u64::MAX >> (64 - signal.length),
+            _ => raw == 1 << (signal.length - 1),
+        };
         if !only_the_sign || matches!(signal.kind, ValueKind::Unsigned | ValueKind::Signed) {
             prop_assert_eq!(values[0].raw, raw);
         }

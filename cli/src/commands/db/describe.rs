@@ -131,6 +131,7 @@ fn kind(kind: ValueKind) -> &'static str {
         ValueKind::Unsigned => "unsigned",
         ValueKind::Signed => "signed",
         ValueKind::SignMagnitude => "sign-magnitude",
+        ValueKind::OnesComplement => "one's complement",
         ValueKind::Half => "half",
         ValueKind::Single => "float",
         ValueKind::Double => "double",

@@ -56,8 +56,15 @@ impl Whole {
 
     /// The block at a place, which must have this name.
     pub(super) fn block(&mut self, at: u64, name: [u8; 4]) -> Result<Block, Fault> {
+        /// As many links as these have at least: one that is not there would say that there is nothing behind it.
+        const LEAST_LINKS: [(&[u8; 4], usize); 4] = [(b"##HD", 6), (b"##DG", 4), (b"##CG", 6), (b"##CN", 8)];
         let block = self.any_block(at)?;
-        if block.name == name {
+        let least = LEAST_LINKS.iter().find(|(of, _)| **of == name).map_or(0, |(_, least)| *least);
+        if block.name == name && block.links.len() < least {
+            let expected =
+                format!("{least} links in the block {} at {at:#x}", String::from_utf8_lossy(&name));
+            Err(Fault::malformed(expected, block.links.len().to_string().as_bytes()))
+        } else if block.name == name {
             Ok(block)
         } else {
             let expected = format!("the block {} at {at:#x}", String::from_utf8_lossy(&name));

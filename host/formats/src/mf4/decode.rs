@@ -69,6 +69,8 @@ struct Part {
     counts: Vec<u64>,
     /// Sorted: how many there are.
     records: u64,
+    /// Whether the file says how many records each group has.
+    is_counted: bool,
     waiting: VecDeque<(usize, u64, Vec<u8>, u64)>,
     time_ns: i64,
     next: Option<Item>,
@@ -194,6 +196,9 @@ fn collect(
     let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
     let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
     let (mut next, mut count) = (header.link(0), 0);
+    if next == 0 {
+        return Err(Fault::malformed("a group of data", b"none"));
+    }
     while next != 0 {
         let group = file.block(next, *b"##DG")?;
         next = group.link(0);
@@ -240,8 +245,8 @@ impl Part {
         let values = values.map(|group| (group.address, Values::default())).collect();
         let stream = Stream::open(file, block.link(2), open_end)?;
         let is_sorted = groups.len() == 1 && id_bytes == 0;
-        let counted = is_sorted && open & OPEN_COUNTERS == 0;
-        let records = if counted { groups[0].records } else { u64::MAX };
+        let is_counted = open & OPEN_COUNTERS == 0;
+        let records = if is_sorted && is_counted { groups[0].records } else { u64::MAX };
         let part = Self {
             start_ns,
             id_bytes,
@@ -253,6 +258,7 @@ impl Part {
             stream,
             at: 0,
             records,
+            is_counted,
             waiting: VecDeque::new(),
             time_ns: start_ns,
             next: None,
@@ -289,12 +295,7 @@ impl Part {
                     let fault = Fault::malformed("the bytes of each frame", found.as_bytes());
                     return Ok(Some(Item::Fault(place, fault)));
                 }
-                let is_short = self.records != u64::MAX && self.counts[0] < self.records;
-                if self.stream.is_cut() || is_short || self.at < self.stream.len() && self.records == u64::MAX
-                {
-                    return Ok(Some(Item::Fault(self.at, Fault::Truncated("a group of frames"))));
-                }
-                return Ok(None);
+                return Ok(self.fault_of_end().map(|fault| Item::Fault(self.at, fault)));
             };
             match &self.groups[group].content {
                 Content::Values => {
@@ -340,6 +341,32 @@ impl Part {
                 }
             }
         }
+    }
+
+    /// What is wrong where no record follows.
+    fn fault_of_end(&self) -> Option<Fault> {
+        let rest = self.stream.len().saturating_sub(self.at);
+        let is_sorted = self.records != u64::MAX;
+        let is_short = is_sorted && self.counts[0] < self.records;
+        if self.stream.is_cut() || is_short || rest > 0 && !is_sorted {
+            return Some(Fault::Truncated("a group of frames"));
+        }
+        // The counter is damaged, or the file's writer had more room than records.
+        if is_sorted && rest >= self.groups[0].record_bytes.max(1) as u64 {
+            let expected = format!("no more data than the {} records that are counted", self.records);
+            return Some(Fault::malformed(expected, format!("{rest} bytes more").as_bytes()));
+        }
+        if is_sorted || !self.is_counted {
+            return None;
+        }
+        // What belongs to which group stands in front of each record, and may be damaged.
+        let counts = self.groups.iter().zip(&self.counts);
+        let differs = |(group, count): &(&Group, &u64)| {
+            !matches!(group.content, Content::Values) && group.records != **count
+        };
+        let (group, count) = counts.into_iter().find(differs)?;
+        let expected = format!("{} records of a group, as are counted", group.records);
+        Some(Fault::malformed(expected, count.to_string().as_bytes()))
     }
 
     fn cut(&mut self) -> Item {

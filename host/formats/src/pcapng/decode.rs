@@ -73,6 +73,30 @@ impl<'a> Fields<'a> {
         Some(if self.big_endian { u64::from_be_bytes(bytes) } else { u64::from_le_bytes(bytes) })
     }
 
+    /// Where the list of codes and values from `at` on ends, which options are and names; `None` if it is none.
+    fn end_of_list(self, mut at: usize) -> Option<usize> {
+        while at < self.bytes.len() {
+            let (code, len) = (self.u16(at)?, usize::from(self.u16(at + 2)?));
+            at += 4 + len.next_multiple_of(4);
+            if code == END {
+                return Some(at);
+            }
+        }
+        Some(at)
+    }
+
+    /// Whether a block without a packet is filled by what it should have: another one's kind may be damaged.
+    fn is_filled(self, kind: u32) -> bool {
+        let options = match kind {
+            INTERFACE_DESCRIPTION => Some(8),
+            STATISTICS => Some(12),
+            NAME_RESOLUTION => self.end_of_list(0),
+            SECRETS => self.u32(4).map(|len| 8 + (len as usize).next_multiple_of(4)),
+            _ => return true,
+        };
+        options.and_then(|at| self.end_of_list(at)) == Some(self.bytes.len())
+    }
+
     /// The options from `at` on: code and value.
     fn options(self, mut at: usize) -> impl Iterator<Item = (u16, Fields<'a>)> {
         std::iter::from_fn(move || {
@@ -147,6 +171,10 @@ fn damaged(len: usize) -> Fault {
     Fault::malformed("a block with the same length at both ends", format!("a length of {len}").as_bytes())
 }
 
+fn not_filled() -> Fault {
+    Fault::malformed("a block whose options end where it does", b"another end; a packet may have been in it")
+}
+
 impl Decoder {
     /// Takes the byte order from a section header. False if the file does not begin with one.
     fn byte_order(&mut self, head: [u8; BLOCK_FRAME_BYTES]) -> bool {
@@ -209,7 +237,7 @@ impl Decoder {
             }
             INTERFACE_DESCRIPTION => {
                 self.describe(fields).ok_or_else(short)?;
-                Ok(None)
+                if fields.is_filled(kind) { Ok(None) } else { Err(not_filled()) }
             }
             ENHANCED_PACKET | OBSOLETE_PACKET => {
                 let interface = match kind {
@@ -230,7 +258,13 @@ impl Decoder {
             }
             // It has no time.
             SIMPLE_PACKET => Err(Fault::Unsupported("a packet without a time".into())),
-            NAME_RESOLUTION | STATISTICS | SECRETS | CUSTOM | CUSTOM_NOT_COPIED => Ok(None),
+            NAME_RESOLUTION | STATISTICS | SECRETS | CUSTOM | CUSTOM_NOT_COPIED => {
+                if fields.is_filled(kind) {
+                    Ok(None)
+                } else {
+                    Err(not_filled())
+                }
+            }
             // A packet could have been in it.
             _ => Ok(Some(Found::LeftOut("blocks of kinds that are not known"))),
         }

@@ -108,7 +108,7 @@ fn range_error(signal: &Signal, value: String) -> EncodeError {
     let mask = layout::mask(signal.length);
     let (low, high) = match signal.kind {
         ValueKind::Unsigned => (0, mask),
-        ValueKind::Signed => (mask / 2 + 1, mask / 2),
+        ValueKind::Signed | ValueKind::OnesComplement => (mask / 2 + 1, mask / 2),
         ValueKind::SignMagnitude => (mask, mask / 2),
         ValueKind::Half => (0xFBFF, 0x7BFF),
         ValueKind::Single => (u64::from(f32::MIN.to_bits()) >> (32 - signal.length.min(32)), {
@@ -143,6 +143,7 @@ fn raw_of_integer(signal: &Signal, value: i128) -> Option<u64> {
                 u64::try_from(value.checked_neg()?).ok().filter(|&magnitude| magnitude <= mask >> 1)?;
             magnitude | mask ^ mask >> 1
         }
+        ValueKind::OnesComplement if value < 0 => (value - 1) as u64 & mask,
         _ => value as u64 & mask,
     };
     // Whatever does not read back as the value does not fit.

@@ -9,7 +9,8 @@ use cantap::wire::Refusal;
 use cantap_formats::{Format, NothingRead, OpenError, UnknownFormat};
 use cantap_signals::condition::{ConditionError, ConditionFault};
 
-use crate::server::Server;
+use cantap_address::LinkError;
+use cantap_address::server::Server;
 
 /// Where nothing could be read.
 const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
@@ -36,13 +37,20 @@ pub fn told(error: &(dyn Error + 'static)) -> String {
     if let Some(condition) = error.downcast_ref::<ConditionError>() {
         return of_condition(condition);
     }
-    let advice = error
-        .downcast_ref()
+    let advice = device_error(error)
         .and_then(of_device)
         .or_else(|| error.downcast_ref().and_then(of_timing))
         .or_else(|| error.downcast_ref().map(|_: &NothingRead| NAME_THE_FORMAT.to_owned()))
         .or_else(|| unknown_format(error).and_then(|unknown| of_format(unknown, option(error))));
     advice.map_or_else(|| error.to_string(), |advice| format!("{error}{advice}"))
+}
+
+/// What a device says, also on the way to it.
+fn device_error<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e DeviceError> {
+    match error.downcast_ref() {
+        Some(LinkError::Device(error)) => Some(error),
+        _ => error.downcast_ref(),
+    }
 }
 
 fn of_device(error: &DeviceError) -> Option<String> {

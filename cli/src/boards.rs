@@ -5,10 +5,10 @@ use cantap::device::channel_number;
 use cantap::wire::CHANNELS;
 use cantap_trace::filter::Filter;
 
-use crate::address::{Address, OpenDevice};
 use crate::args::Channels;
 use crate::completion;
 use crate::wrong::wrong;
+use cantap_address::{Address, OpenDevice};
 
 /// More than this many boards no command takes: channels are numbered up to 32.
 const MOST: usize = 16;
@@ -34,7 +34,7 @@ impl OneBoard {
 
     /// Begins a session with it.
     pub fn open(&self) -> anyhow::Result<OpenDevice> {
-        self.address()?.open()
+        Ok(self.address()?.open()?)
     }
 }
 

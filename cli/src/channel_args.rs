@@ -10,11 +10,11 @@ use cantap::recovery::Recovery;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode};
 use cantap_trace::filter::Filter;
 
-use crate::address::OpenDevice;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
+use cantap_address::OpenDevice;
 
 /// How to open a channel; for commands to flatten into theirs.
 #[derive(clap::Args, Clone, Debug, Default)]

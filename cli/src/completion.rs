@@ -11,8 +11,8 @@ use cantap_formats::Format;
 use cantap_signals::Database;
 use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter};
 
-use crate::address::Address;
 use crate::shells;
+use cantap_address::Address;
 
 /// Suffixes of databases.
 const DATABASES: [&str; 5] = ["dbc", "kcd", "sym", "arxml", "toml"];

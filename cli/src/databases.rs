@@ -6,8 +6,8 @@ use std::str::FromStr;
 use anyhow::{Context, bail};
 use cantap_signals::{Database, DatabaseError, Decoder, Override, Selection, Source};
 
-use crate::address::Address;
 use crate::completion;
+use cantap_address::Address;
 
 /// Which databases; for commands to flatten into theirs.
 #[derive(Clone, clap::Args)]

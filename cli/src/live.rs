@@ -10,13 +10,13 @@ use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap_formats::ChannelInfo;
 
-use crate::address::{Address, OpenDevice};
 use crate::boards::{Boards, filters_on, place_of};
 use crate::channel_args::{self, ChannelArgs};
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::{advice, args, interrupt, stderr};
+use cantap_address::{Address, OpenDevice};
 
 /// Which devices, and how; for commands to flatten into theirs, beside an input file.
 #[derive(clap::Args)]
@@ -51,7 +51,7 @@ where
 {
     let line = |(board, address): (usize, &Address)| {
         let (at, mut setup) = (address.clone(), setup.clone());
-        let connect = move |serial: Option<&str>| at.open_again(serial);
+        let connect = move |serial: Option<&str>| Ok(at.open_again(serial)?);
         Line::new(&address.to_string(), connect, move |device| setup(board, device))
     };
     Several::new(addresses.iter().enumerate().map(line).collect())

@@ -20,7 +20,6 @@ macro_rules! eprint {
     }};
 }
 
-mod address;
 mod advice;
 mod args;
 mod beside;
@@ -46,7 +45,6 @@ mod progress;
 mod protocols;
 mod rescue;
 mod sending;
-mod server;
 mod shells;
 mod speaking;
 mod stderr;
@@ -100,7 +98,7 @@ fn main() -> ExitCode {
 /// what is wrong with a condition, in one line.
 fn leave(error: &clap::Error) -> ! {
     let address = error.source().and_then(|source| source.downcast_ref());
-    if let Some(address @ address::AddressError::Option { .. }) = address {
+    if let Some(address @ cantap_address::AddressError::Option { .. }) = address {
         eprintln!("cantap: {address}");
         std::process::exit(exit::WRONG_COMMAND_LINE.into());
     }

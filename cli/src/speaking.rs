@@ -14,7 +14,6 @@ use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
 
-use crate::address::{Address, OpenDevice};
 use crate::boards::the_one_connected;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -24,6 +23,7 @@ use crate::sending::Sending;
 use crate::words::{counted, state_name};
 use crate::wrong::wrong;
 use crate::{args, interrupt};
+use cantap_address::{Address, OpenDevice};
 
 /// The longest time between two looks at what is being sent, and at Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

@@ -1,9 +1,11 @@
 //! What Python code catches.
 
+use std::error::Error as _;
 use std::io;
 use std::path::Path;
 
 use cantap::DeviceError as DeviceFault;
+use cantap_address::LinkError;
 use cantap_columns::BadColumns;
 use cantap_columns::parquet::ParquetError;
 use cantap_formats::{Fault, NothingRead, OpenError, ReadIssue};
@@ -74,6 +76,24 @@ impl Error {
     /// A wrong argument, in words.
     pub fn argument(words: impl ToString) -> Self {
         Self::Argument(words.to_string())
+    }
+}
+
+/// What an error does not say itself of what caused it.
+fn because(error: &LinkError) -> String {
+    let cause = error.source().map(ToString::to_string);
+    cause
+        .filter(|cause| !error.to_string().contains(cause))
+        .map(|cause| format!(": {cause}"))
+        .unwrap_or_default()
+}
+
+impl From<LinkError> for Error {
+    fn from(error: LinkError) -> Self {
+        match error {
+            LinkError::Device(error) => Self::Device(error),
+            error => Self::Address(format!("{error}{}", because(&error))),
+        }
     }
 }
 

@@ -25,16 +25,29 @@ pub fn dist(shell: &Shell) -> Result<[PathBuf; 2]> {
     shell.create_dir(&unpacked)?;
     cmd!(shell, "tar --extract --file {archive} --directory {unpacked}").run()?;
     let sources = only_file(&unpacked)?;
-    Ok([wheel(shell, &sources, "release", &target().join("dist"))?, archive])
+    Ok([wheel(shell, &sources, Profile::Release, &target().join("dist"))?, archive])
 }
 
-/// Builds a wheel of the sources in a folder by a profile of the package's and returns its path.
-fn wheel(shell: &Shell, sources: &Path, profile: &str, out: &Path) -> Result<PathBuf> {
+/// What a wheel is built for.
+#[derive(Clone, Copy)]
+enum Profile {
+    /// For tests: the workspace's profile, beside its own, so that what other people's crates compile to is shared.
+    Dev,
+    /// For users.
+    Release,
+}
+
+/// Builds a wheel of the sources in a folder and returns its path.
+fn wheel(shell: &Shell, sources: &Path, profile: Profile, out: &Path) -> Result<PathBuf> {
     let maturin = peers::venv(shell)?.join("bin/maturin");
     let manifest = sources.join(MANIFEST);
+    let (profile, compiled) = match profile {
+        Profile::Dev => ("dev", workspace::target()),
+        Profile::Release => ("release", target()),
+    };
     shell.remove_path(out)?;
     cmd!(shell, "{maturin} build --manifest-path {manifest} --profile {profile} --out {out}")
-        .env("CARGO_TARGET_DIR", target())
+        .env("CARGO_TARGET_DIR", compiled)
         .run()?;
     only_file(out)
 }
@@ -46,7 +59,7 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
     }
     // Lints first: they need no wheel.
     cmd!(shell, "cargo fmt --manifest-path {MANIFEST} --check").run()?;
-    let wheel = wheel(shell, &workspace::root(), "ci", &target().join("wheels"))?;
+    let wheel = wheel(shell, &workspace::root(), Profile::Dev, &target().join("wheels"))?;
     let python = environment(shell, &wheel)?;
     cmd!(shell, "{python} -m mypy --config-file python/pyproject.toml python/cantap").run()?;
     cmd!(shell, "{python} -m mypy.stubtest cantap._native").run()?;
@@ -64,12 +77,12 @@ pub fn check(shell: &Shell, peers: Option<&Peers>) -> Result<Outcome> {
 #[cfg(feature = "bench")]
 pub fn measure() -> Result<()> {
     let shell = workspace::shell()?;
-    let wheel = wheel(&shell, &workspace::root(), "release", &target().join("dist"))?;
+    let wheel = wheel(&shell, &workspace::root(), Profile::Release, &target().join("dist"))?;
     let python = environment(&shell, &wheel)?;
     Ok(cmd!(shell, "{python} python/bench/side_by_side.py").run()?)
 }
 
-/// Where its crates are compiled: with features and profiles of their own.
+/// Where what belongs to it is made.
 fn target() -> PathBuf {
     workspace::target().join("python")
 }

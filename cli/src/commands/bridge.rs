@@ -22,12 +22,12 @@ use cantap::wire::message::Mode;
 use self::interface::CanPort;
 use self::lane::Lane;
 use self::sender::Sender;
-use crate::address::OpenDevice;
 use crate::boards::OneBoard;
 use crate::channel_args::ChannelArgs;
 use crate::hearing::{self, Hearing};
 use crate::wrong::wrong;
 use crate::{advice, args, interrupt, live, stderr};
+use cantap_address::OpenDevice;
 
 /// The command line.
 #[derive(clap::Args)]

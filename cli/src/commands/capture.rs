@@ -15,7 +15,6 @@ use cantap_trace::filter::Filter;
 use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
 use super::convert::WriteArgs;
-use crate::address::Address;
 use crate::args;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
@@ -26,6 +25,7 @@ use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
+use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

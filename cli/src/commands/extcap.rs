@@ -22,9 +22,9 @@ use cantap_trace::filter::Filter;
 use self::bit_rates::BitRate;
 use self::capture::Wanted;
 use self::toolbar::Toolbar;
-use crate::address::Address;
 use crate::completion;
 use crate::wrong::wrong;
+use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -11,7 +11,6 @@ use cantap::wire::message::Mode;
 use cantap_formats::WriteOptions;
 use cantap_trace::filter::Filter;
 
-use crate::address::{Address, AddressError};
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
@@ -28,6 +27,7 @@ use crate::monitor::{Once, once, orders, picture, run as show, text};
 use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
+use cantap_address::{Address, AddressError};
 
 /// The command line.
 #[derive(clap::Args)]

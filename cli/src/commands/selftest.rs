@@ -14,9 +14,9 @@ use anyhow::Context;
 use cantap::{Channel, Device};
 
 use self::report::{Outcome, Report};
-use crate::address::{Address, OpenDevice};
 use crate::boards::OneBoard;
 use crate::{args, beside, exit, interrupt};
+use cantap_address::{Address, OpenDevice};
 
 /// The command line.
 #[derive(clap::Args)]

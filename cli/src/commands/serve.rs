@@ -14,20 +14,20 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::{Context, bail};
+use cantap::Channel;
 use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
-use cantap::{Channel, DeviceError};
 use cantap_serve::listen::{self, Listening};
 use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
 
-use crate::address::Address;
 use crate::args::Channels;
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::server::{PORT, role};
 use crate::timing_args::TimingArgs;
 use crate::wrong::wrong;
 use crate::{interrupt, stderr};
+use cantap_address::server::{PORT, role};
+use cantap_address::{Address, LinkError};
 
 /// The command line.
 #[derive(clap::Args)]
@@ -147,9 +147,9 @@ fn start(args: &Args, number: usize, address: &Address) -> anyhow::Result<Board>
     let settings = Settings { bitrates_bps, ..Settings::default() };
     let at = address.clone();
     let connect = Box::new(move |serial: Option<&str>| {
-        at.link(serial).map_err(|error| match error.downcast::<DeviceError>() {
-            Ok(error) => error.into(),
-            Err(error) => error.into(),
+        at.link(serial).map_err(|error| match error {
+            LinkError::Device(error) => error.into(),
+            error => error.into(),
         })
     });
     Board::start(&address.to_string(), connect, settings, tell).map_err(|error| match error {

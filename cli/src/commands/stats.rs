@@ -13,13 +13,13 @@ use anyhow::Context;
 use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
 
 use self::windows::Windows;
-use crate::address::Address;
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::input::ReadArgs;
 use crate::missing::{Missing, by_kind};
 use crate::protocols::{Known, ProtocolArgs};
+use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -6,8 +6,8 @@ use std::process::{Command, ExitCode};
 
 use anyhow::{Context, bail};
 
-use crate::address::Address;
 use crate::completion;
+use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -2,17 +2,17 @@
 
 use std::borrow::Borrow;
 use std::fmt;
+use std::io;
 use std::ops::Deref;
 use std::path::Path;
 use std::str::FromStr;
 
-use anyhow::Context;
 use cantap::device::Link;
 use cantap::wire::CHANNELS;
-use cantap::{Channel, Device};
+use cantap::{Channel, Device, DeviceError};
 use cantap_virtual::Options;
 
-use crate::server::Server;
+use crate::server::{Server, ServerError};
 
 /// The virtual device's buses have the bit rate of whoever opens a channel: this one, if nobody says another.
 const VIRTUAL_BITRATE_BPS: u32 = 500_000;
@@ -62,6 +62,30 @@ pub enum AddressError {
     #[cfg(not(feature = "emu"))]
     #[error("this build of cantap has no support for '{0}'; build it with the feature `emu`")]
     NotBuilt(String),
+}
+
+/// Why there is no way to a device.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum LinkError {
+    /// The port cannot be opened, or what is there is no cantap.
+    #[error(transparent)]
+    Device(#[from] DeviceError),
+    /// The server cannot be used.
+    #[error(transparent)]
+    Server(#[from] ServerError),
+    /// The virtual device has no thread to live in.
+    #[error("the system refused a thread; close other programs and try again")]
+    Virtual(#[source] io::Error),
+    /// The firmware's ELF cannot be used, or does not start.
+    #[cfg(feature = "emu")]
+    #[error("the emulated board at '{address}' does not start")]
+    Emulated {
+        /// As it was given.
+        address: String,
+        /// Why.
+        source: cantap_sim::address::AddressError,
+    },
 }
 
 impl FromStr for Address {
@@ -144,33 +168,33 @@ impl Address {
 
     /// Begins a session with the board of a serial number, wherever it is plugged in now, as far as the system tells; else with
     /// whatever is at the address.
-    pub fn open_again(&self, serial_number: Option<&str>) -> anyhow::Result<OpenDevice> {
+    pub fn open_again(&self, serial_number: Option<&str>) -> Result<OpenDevice, LinkError> {
         let device = Device::over(self.link(serial_number)?, &self.text)?;
         Ok(OpenDevice { device, bitrates: self.bitrates_of_buses() })
     }
 
     /// Begins a session with the device.
-    pub fn open(&self) -> anyhow::Result<OpenDevice> {
+    pub fn open(&self) -> Result<OpenDevice, LinkError> {
         self.open_again(None)
     }
 
     /// The way to the device; to the board of a serial number wherever it is now, as far as the system tells.
-    pub fn link(&self, serial_number: Option<&str>) -> anyhow::Result<Link> {
+    pub fn link(&self, serial_number: Option<&str>) -> Result<Link, LinkError> {
         Ok(match &self.place {
             Place::Serial => {
                 let port = serial_number.and_then(cantap::device::port_of);
                 cantap::device::open_port(port.as_deref().unwrap_or(&self.text))?
             }
             Place::Server(server) => server.link()?,
-            Place::Virtual(options) => cantap_virtual::start((**options).clone())
-                .context("the system refused a thread; close other programs and try again")?
-                .into_link(),
+            Place::Virtual(options) => {
+                cantap_virtual::start((**options).clone()).map_err(LinkError::Virtual)?.into_link()
+            }
             #[cfg(feature = "emu")]
             Place::Emulated(board) => {
                 let port = (**board)
                     .clone()
                     .open()
-                    .with_context(|| format!("the emulated board at '{self}' does not start"))?;
+                    .map_err(|source| LinkError::Emulated { address: self.to_string(), source })?;
                 Link::new(port.reader, port.writer).keeping(port.device)
             }
         })

@@ -7,4 +7,4 @@
 mod address;
 pub mod server;
 
-pub use address::{Address, AddressError, OpenDevice};
+pub use address::{Address, AddressError, LinkError, OpenDevice};

@@ -1,12 +1,10 @@
 //! Where a server is that shares a board: `unix:PATH`, `tcp://HOST:PORT`, `tls://HOST:PORT`, `ssh://[USER@]HOST[/DEVICE]`.
 
-use std::io::ErrorKind;
+use std::io::{self, ErrorKind};
 #[cfg(any(unix, feature = "tls"))]
 use std::path::PathBuf;
 use std::process::Command;
 
-#[cfg(feature = "tls")]
-use anyhow::Context;
 use cantap::device::Link;
 use cantap_serve::{Role, connect};
 
@@ -37,6 +35,77 @@ pub struct Ssh {
     device: Option<String>,
     /// What this client may do.
     allow: Role,
+}
+
+/// Why a server cannot be used. Each says what to do next.
+#[derive(Debug, thiserror::Error)]
+#[non_exhaustive]
+pub enum ServerError {
+    /// Nobody listens there.
+    #[error("'{server}': there is no server; start one with `cantap serve` ({source})")]
+    Absent {
+        /// As it was addressed.
+        server: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// It is another user's.
+    #[error("'{server}': it belongs to another user of this computer, who alone can use it ({source})")]
+    NotYours {
+        /// As it was addressed.
+        server: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// The way there fails.
+    #[error("'{server}': it cannot be reached ({source})")]
+    Unreachable {
+        /// As it was addressed.
+        server: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// What ssh started there gives no answer.
+    #[error(
+        "'{host}': no server there answers ({source}); try `{program} {host} cantap serve --stdio` by hand"
+    )]
+    Mute {
+        /// The other computer.
+        host: String,
+        /// ssh, or what `CANTAP_SSH` names.
+        program: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// ssh does not start.
+    #[error("'{program}' does not start ({source}); install it, or name another in CANTAP_SSH")]
+    NoSsh {
+        /// ssh, or what `CANTAP_SSH` names.
+        program: String,
+        /// What the system says.
+        source: io::Error,
+    },
+    /// An encrypted connection needs keys.
+    #[cfg(feature = "tls")]
+    #[error(
+        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or behind the address as ?keys=FOLDER/NAME"
+    )]
+    NoKeys,
+    /// These cannot be the names of keys.
+    #[cfg(feature = "tls")]
+    #[error("'{}' names no keys; write FOLDER/NAME, as for FOLDER/NAME.pem", .0.display())]
+    BadKeys(PathBuf),
+    /// No encrypted connection comes about.
+    #[cfg(feature = "tls")]
+    #[error(
+        "'{server}' lets nobody in with these keys, or is not there; they and the server's must be of one authority"
+    )]
+    Tls {
+        /// As it was addressed.
+        server: String,
+        /// What went wrong.
+        source: cantap_serve::tls::TlsError,
+    },
 }
 
 /// How servers' addresses begin.
@@ -78,62 +147,43 @@ impl Server {
     }
 
     /// Connects to it.
-    pub fn link(&self) -> anyhow::Result<Link> {
-        let (name, linked) = match self {
+    pub fn link(&self) -> Result<Link, ServerError> {
+        let (server, linked) = match self {
             #[cfg(unix)]
             Self::Unix(path) => (path.display().to_string(), connect::unix(path)),
             Self::Tcp(address) => (address.clone(), connect::tcp(address)),
             #[cfg(feature = "tls")]
             Self::Tls(address, keys) => {
                 let linked = cantap_serve::tls::connect(address, &files(keys.as_deref())?);
-                return linked.with_context(|| {
-                    format!(
-                        "'{address}' lets nobody in with these keys, or is not there; they and the server's must be of one authority"
-                    )
-                });
+                return linked.map_err(|source| ServerError::Tls { server: address.clone(), source });
             }
             Self::Ssh(ssh) => {
                 let mut command = ssh.command();
                 let program = command.get_program().to_string_lossy().into_owned();
-                return connect::program(&mut command).map_err(|error| match error.kind() {
-                    ErrorKind::TimedOut => anyhow::anyhow!(
-                        "'{}': no server there answers ({error}); try `{program} {} cantap serve --stdio` by hand",
-                        ssh.host,
-                        ssh.host
-                    ),
-                    _ => anyhow::anyhow!(
-                        "'{program}' does not start ({error}); install it, or name another in CANTAP_SSH"
-                    ),
+                return connect::program(&mut command).map_err(|source| match source.kind() {
+                    ErrorKind::TimedOut => ServerError::Mute { host: ssh.host.clone(), program, source },
+                    _ => ServerError::NoSsh { program, source },
                 });
             }
         };
-        linked.map_err(|error| {
-            let advice = match error.kind() {
-                ErrorKind::NotFound | ErrorKind::ConnectionRefused => {
-                    "there is no server; start one with `cantap serve`"
-                }
-                ErrorKind::PermissionDenied => {
-                    "it belongs to another user of this computer, who alone can use it"
-                }
-                _ => "it cannot be reached",
-            };
-            anyhow::anyhow!("'{name}': {advice} ({error})")
+        linked.map_err(|source| match source.kind() {
+            ErrorKind::NotFound | ErrorKind::ConnectionRefused => ServerError::Absent { server, source },
+            ErrorKind::PermissionDenied => ServerError::NotYours { server, source },
+            _ => ServerError::Unreachable { server, source },
         })
     }
 }
 
 /// This client's keys: those that the address names, else those of `CANTAP_KEYS`.
 #[cfg(feature = "tls")]
-fn files(keys: Option<&std::path::Path>) -> anyhow::Result<cantap_serve::tls::Files> {
+fn files(keys: Option<&std::path::Path>) -> Result<cantap_serve::tls::Files, ServerError> {
     let of_environment =
         || std::env::var_os("CANTAP_KEYS").filter(|keys| !keys.is_empty()).map(PathBuf::from);
-    let keys = keys.map(PathBuf::from).or_else(of_environment).context(
-        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or behind the address as ?keys=FOLDER/NAME",
-    )?;
-    let (Some(folder), Some(name)) = (keys.parent(), keys.file_name().and_then(|name| name.to_str())) else {
-        anyhow::bail!("'{}' names no keys; write FOLDER/NAME, as for FOLDER/NAME.pem", keys.display());
-    };
-    Ok(cantap_serve::tls::Keys::files(folder, name))
+    let keys = keys.map(PathBuf::from).or_else(of_environment).ok_or(ServerError::NoKeys)?;
+    match (keys.parent(), keys.file_name().and_then(|name| name.to_str())) {
+        (Some(folder), Some(name)) => Ok(cantap_serve::tls::Keys::files(folder, name)),
+        _ => Err(ServerError::BadKeys(keys)),
+    }
 }
 
 /// The port that goes without saying.

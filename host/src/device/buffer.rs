@@ -60,12 +60,16 @@ impl Buffer {
     }
 
     /// Takes the records out of `batch`, leaving it empty, and returns how many frames found no room, per
-    /// channel.
+    /// channel. What comes behind the end belongs to nobody: it is neither kept nor lost.
     pub fn push(&self, batch: &mut Vec<TraceRecord>) -> [u32; CHANNELS] {
         if batch.is_empty() {
             return [0; CHANNELS];
         }
         let mut state = self.lock();
+        if state.end.is_some() {
+            batch.clear();
+            return [0; CHANNELS];
+        }
         let mut lost = [0; CHANNELS];
         let fits = state.records + batch.len() <= self.capacity;
         if !fits {
@@ -194,6 +198,22 @@ mod tests {
         let event =
             TraceEvent::Frame { frame: "123#".parse().unwrap(), direction: Direction::Rx, late: false };
         times.map(|time_ns| TraceRecord { time_ns, channel: 2, event }).collect()
+    }
+
+    /// Whoever closed the stream reads as many losses in it as it counts.
+    #[test]
+    fn what_comes_behind_the_end_is_not_lost() {
+        let buffer = Buffer::new(1);
+        assert_eq!(buffer.push(&mut frames(0..2)), [0, 2]);
+        buffer.finish();
+        let mut late = frames(2..4);
+        assert_eq!((buffer.push(&mut late), late.len()), ([0, 0], 0));
+        let all: Vec<_> = std::iter::from_fn(|| buffer.pop(None).unwrap()).flatten().collect();
+        let losses = |record: &TraceRecord| match record.event {
+            TraceEvent::Lost { count, .. } => count,
+            _ => 0,
+        };
+        assert_eq!(all.iter().map(losses).sum::<u32>(), 2);
     }
 
     #[test]

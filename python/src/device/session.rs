@@ -49,10 +49,7 @@ impl Session {
     /// Begins a session with the device at an address.
     pub fn open(address: &str) -> Result<Self, Error> {
         let place = address.parse::<Address>().map_err(Error::argument)?;
-        let device = place.open().map_err(|error| match error.downcast::<DeviceError>() {
-            Ok(error) => Error::Device(error),
-            Err(error) => Error::Address(format!("{error:#}")),
-        })?;
+        let device = place.open()?;
         let fanout = Arc::new(Fanout::default());
         let (records, ends) = (device.records(), device.transmissions());
         let for_records = Arc::clone(&fanout);

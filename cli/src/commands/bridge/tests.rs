@@ -19,7 +19,7 @@ use super::interface::{Known, Port};
 use super::lane::Lane;
 use super::places;
 use super::sender::Sender;
-use crate::address::{Address, OpenDevice};
+use cantap_address::{Address, OpenDevice};
 
 /// An interface in memory.
 #[derive(Default)]

@@ -6,11 +6,11 @@ use std::path::Path;
 use cantap::device::{Gaps, channel_number};
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
-use crate::address::Address;
 use crate::boards::Boards;
 use crate::live::{Line, LiveRecords};
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
+use cantap_address::Address;
 
 /// A channel in the JSON object.
 #[derive(serde::Serialize)]

@@ -15,12 +15,12 @@ use super::bit_rates::{BitRate, settle};
 use super::pipe::Opening;
 use super::toolbar::{Change, Toolbar};
 use super::traffic::Traffic;
-use crate::address::Address;
 use crate::boards::Boards;
 use crate::channel_args::{self, ChannelArgs};
 use crate::live::{Line, LiveRecords};
 use crate::losses::Losses;
 use crate::{advice, args, exit, interrupt};
+use cantap_address::Address;
 
 /// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once.
 const FLUSH_EVERY: Duration = Duration::from_millis(50);

@@ -2,7 +2,7 @@
 
 use cantap::device::Board;
 
-use crate::address::Address;
+use cantap_address::Address;
 
 /// An interface.
 #[derive(Clone, Debug, PartialEq, Eq)]

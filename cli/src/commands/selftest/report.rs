@@ -6,7 +6,7 @@ use std::time::{Instant, SystemTime, UNIX_EPOCH};
 use cantap::Device;
 use serde_json::{Value, json};
 
-use crate::address::Address;
+use cantap_address::Address;
 
 /// How a step went.
 #[derive(Clone, Debug)]

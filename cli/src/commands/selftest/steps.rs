@@ -8,8 +8,8 @@ use cantap::{Channel, Device};
 use serde_json::{Value, json};
 
 use super::report::Outcome;
-use crate::address::{Address, OpenDevice};
 use crate::meter::rounded;
+use cantap_address::{Address, OpenDevice};
 
 /// Questions for the device's time.
 const ROUND_TRIPS: usize = 500;
@@ -133,7 +133,7 @@ pub fn restart(address: &Address, device: OpenDevice, serial: &str) -> Result {
     let device = loop {
         match address.open() {
             Ok(device) => break device,
-            Err(error) if asked.elapsed() > RESTART_PATIENCE => return Err(error),
+            Err(error) if asked.elapsed() > RESTART_PATIENCE => return Err(error.into()),
             Err(_) => std::thread::sleep(Duration::from_millis(100)),
         }
     };

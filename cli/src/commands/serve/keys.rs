@@ -7,8 +7,8 @@ use std::process::ExitCode;
 use cantap_serve::Role;
 use cantap_serve::tls::{Files, Keys, Server};
 
-use crate::server::role;
 use crate::wrong::wrong;
+use cantap_address::server::role;
 
 /// What there is to do beside serving.
 #[derive(clap::Subcommand)]

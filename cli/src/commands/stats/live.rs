@@ -7,13 +7,13 @@ use cantap_analysis::stats::{Statistics, Window};
 
 use super::table::remarks;
 use super::windows::Windows;
-use crate::address::Address;
 use crate::args::Channels;
 use crate::boards::Boards;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::live::{LiveRecords, unasked};
 use crate::protocols::Known;
 use crate::stderr;
+use cantap_address::Address;
 
 /// How long after its end a window is closed, so that what is still on the way gets into it.
 const LATENESS_NS: i64 = 1_000_000_000;

@@ -8,8 +8,8 @@ use super::super::order::Order;
 use super::super::plan::Plan;
 use super::line::PromptKind;
 use super::state::App;
-use crate::address::{Address, AddressError};
 use crate::channel_bitrate::ChannelBitrate;
+use cantap_address::{Address, AddressError};
 
 impl App {
     /// Between listen-only and taking part, which is asked for: whatever acknowledges changes the bus.

@@ -7,8 +7,8 @@ use cantap_formats::Format;
 use super::super::model::Model;
 use super::state::App;
 use super::wish::Wish;
-use crate::address::Address;
 use crate::databases::Said;
+use cantap_address::Address;
 
 impl App {
     /// A database is used from now on, besides the others; a trace is opened beside what runs.

@@ -25,7 +25,7 @@ impl Source<'_> {
             let device = match address.open() {
                 Ok(device) => device,
                 Err(error) => {
-                    said.push(advice::sentence(&error));
+                    said.push(advice::sentence(&error.into()));
                     continue;
                 }
             };

@@ -31,7 +31,7 @@ use super::plan::Plan;
 use super::theme::Theme;
 use super::{orders, screen, text};
 
-use crate::address::Address;
+use cantap_address::Address;
 
 /// A small screen and a wide one.
 const SIZES: [(u16, u16); 2] = [(80, 24), (160, 50)];

@@ -17,9 +17,11 @@
 
 mod bind;
 mod error;
+mod evaluate;
+mod expression;
 mod listener;
 mod syntax;
 
-pub use bind::Condition;
 pub use error::{ConditionError, ConditionFault};
+pub use evaluate::Condition;
 pub use listener::{Listener, Said};

@@ -1,3 +1,0 @@
-//! Where a device is, as users type it after `-d`: `cantap-address` knows.
-
-pub use cantap_address::{Address, AddressError, OpenDevice};

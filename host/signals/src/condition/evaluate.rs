@@ -1,0 +1,306 @@
+//! A condition bound to databases, evaluated record by record.
+
+use crate::{Decoder, SignalValue};
+use cantap_trace::TraceRecord;
+
+use super::bind::{Bound, bind};
+use super::error::ConditionError;
+use super::expression::{Expression, Part, Slot, binary, byte_index, part_of, truth};
+use super::listener::{Deaf, Listener, Listening, Said};
+use super::syntax::{self, Operator};
+
+/// A condition, with the last values of the signals it speaks of.
+#[derive(Clone, Debug)]
+pub struct Condition {
+    expression: Expression,
+    /// Knows the condition's signals only.
+    decoder: Decoder,
+    slots: Vec<Slot>,
+    /// Whether it speaks of the frame itself.
+    about_frames: bool,
+    values: Vec<SignalValue>,
+    concerned: bool,
+    /// For names that a listener knows; none without them.
+    listening: Option<Listening>,
+}
+
+impl Condition {
+    /// Parses a condition; its signals are those of the decoder's databases.
+    pub fn new(text: &str, decoder: &Decoder) -> Result<Self, ConditionError> {
+        Self::with_listener(text, decoder, Box::new(Deaf))
+    }
+
+    /// The same, with the listener's names beside signals, which go before them.
+    pub fn with_listener(
+        text: &str,
+        decoder: &Decoder,
+        mut listener: Box<dyn Listener>,
+    ) -> Result<Self, ConditionError> {
+        let tree = syntax::parse(text)?;
+        let bound = bind(&tree, decoder, &mut *listener).map_err(|(at, fault)| {
+            let text = text.to_owned();
+            ConditionError { text, at, fault }
+        })?;
+        let Bound { expression, slots, about_frames, names } = bound;
+        let names: Vec<_> = names.into_iter().map(|name| (name, false)).collect();
+        let listening = (!names.is_empty()).then(|| Listening { listener, names, matched: Vec::new() });
+        let mut own = decoder.clone();
+        own.retain(|message, index, _| {
+            slots.iter().any(|slot| slot.candidates.contains(&(message, index as u32)))
+        });
+        // A condition without names is looked at for every record.
+        let about_frames = about_frames || slots.is_empty() && listening.is_none();
+        let (values, concerned) = (Vec::new(), false);
+        Ok(Self { expression, decoder: own, slots, about_frames, values, concerned, listening })
+    }
+
+    /// Takes a record and says whether the condition holds now, as far as this record has to do
+    /// with it.
+    pub fn holds(&mut self, record: &TraceRecord) -> bool {
+        self.concerned = self.update(record) || self.about_frames;
+        let holds = self.concerned && self.is_true(record, None);
+        let Some(mut listening) = self.listening.take() else { return holds };
+        let Listening { listener, names, matched } = &mut listening;
+        matched.clear();
+        let mut was_said = false;
+        listener.take(record, &mut |said| {
+            was_said = true;
+            for (name, was_heard) in names.iter_mut().filter(|(_, was_heard)| !was_heard) {
+                *was_heard = said.has(name) == Some(true);
+            }
+            let said = Heard { said, names };
+            if self.is_true(record, Some(&said)) {
+                matched.push(said.said.describe());
+            }
+        });
+        let holds = holds || !matched.is_empty();
+        self.concerned |= was_said;
+        self.listening = Some(listening);
+        holds
+    }
+
+    fn is_true(&self, record: &TraceRecord, said: Option<&Heard<'_>>) -> bool {
+        truth(self.evaluate(&self.expression, record, said)) == Some(true)
+    }
+
+    /// Whether it speaks of the frame itself, or of what frames say together, and not of signals alone.
+    pub fn is_about_frames(&self) -> bool {
+        self.about_frames || self.listening.is_some()
+    }
+
+    /// What was said with the record that [`Self::holds`] took last, and made the condition hold; a line each.
+    pub fn said(&self) -> &[String] {
+        self.listening.as_ref().map_or(&[], |listening| &listening.matched)
+    }
+
+    /// The listener's names in the condition that no event had so far: perhaps there are none such.
+    pub fn unheard(&self) -> impl Iterator<Item = &str> {
+        let names = self.listening.iter().flat_map(|listening| &listening.names);
+        names.filter(|(_, was_heard)| !was_heard).map(|(name, _)| name.as_str())
+    }
+
+    /// Whether the record that [`Self::holds`] took last has to do with the condition: it carries one of
+    /// its signals, or the condition speaks of the frame itself.
+    pub fn was_concerned(&self) -> bool {
+        self.concerned
+    }
+
+    /// Remembers the record's signals; whether there were any.
+    fn update(&mut self, record: &TraceRecord) -> bool {
+        let Some(frame) = record.frame().filter(|_| !self.slots.is_empty()) else { return false };
+        let Some(message) = self.decoder.decode(record.channel, frame, &mut self.values) else {
+            return false;
+        };
+        for value in &self.values {
+            let arrived = (message, value.signal);
+            for slot in &mut self.slots {
+                if let Some(candidate) = slot.candidates.iter().position(|&candidate| candidate == arrived) {
+                    slot.last = Some((candidate, value.raw, value.value));
+                }
+            }
+        }
+        !self.values.is_empty()
+    }
+
+    fn evaluate(
+        &self,
+        expression: &Expression,
+        record: &TraceRecord,
+        said: Option<&Heard<'_>>,
+    ) -> Option<f64> {
+        let boolean = |truth: bool| Some(f64::from(u8::from(truth)));
+        match expression {
+            Expression::Number(value) => Some(*value),
+            Expression::Part(part) => match said {
+                Some(heard) if matches!(part, Part::Channel) => Some(heard.said.channel().into()),
+                // What ends because nothing came is said with a frame that it has nothing to do with.
+                Some(heard) if !heard.said.is_completed_by(record) => None,
+                _ => part_of(*part, record),
+            },
+            Expression::Byte(_) if said.is_some_and(|heard| !heard.said.is_completed_by(record)) => None,
+            Expression::Byte(index) => {
+                let index = byte_index(self.evaluate(index, record, said)?)?;
+                record.frame()?.data().get(index).copied().map(f64::from)
+            }
+            Expression::Signal(slot) => self.slots[*slot].last.map(|(_, _, value)| value),
+            Expression::HasText(slot, raws) => {
+                let (candidate, raw, _) = self.slots[*slot].last?;
+                let (message, index) = self.slots[*slot].candidates[candidate];
+                let signal = &self.decoder.message(message).signals[index as usize];
+                boolean(signal.table_key(raw).is_some_and(|key| raws[candidate].contains(&key)))
+            }
+            Expression::Said(name) => said?.numbers(*name).first().copied(),
+            Expression::IsSaid(name) => boolean(said?.has(*name)?),
+            Expression::AnySaid(name, operator, other, is_left) => {
+                let (heard, other) = (said?, self.evaluate(other, record, said)?);
+                let numbers = heard.numbers(*name);
+                let compare = |number: f64| {
+                    let (left, right) = if *is_left { (number, other) } else { (other, number) };
+                    truth(binary(*operator, left, right))
+                };
+                if numbers.is_empty() {
+                    None
+                } else {
+                    boolean(numbers.iter().any(|number| compare(*number) == Some(true)))
+                }
+            }
+            Expression::SaidText(name, text) => boolean(said?.is_text(*name, text)?),
+            Expression::Not(inner) => boolean(!truth(self.evaluate(inner, record, said))?),
+            Expression::Negative(inner) => self.evaluate(inner, record, said).map(|value| -value),
+            Expression::Binary(operator, left, right) => {
+                let left = self.evaluate(left, record, said);
+                // One side may decide alone, whatever the other is.
+                match (operator, truth(left)) {
+                    (Operator::And, Some(false)) => return boolean(false),
+                    (Operator::Or, Some(true)) => return boolean(true),
+                    _ => {}
+                }
+                let right = self.evaluate(right, record, said);
+                match (operator, truth(right)) {
+                    (Operator::And, Some(false)) => return boolean(false),
+                    (Operator::Or, Some(true)) => return boolean(true),
+                    _ => {}
+                }
+                binary(*operator, left?, right?)
+            }
+        }
+    }
+}
+
+/// An event, by the places of the condition's names.
+struct Heard<'a> {
+    said: &'a dyn Said,
+    names: &'a [(String, bool)],
+}
+
+impl Heard<'_> {
+    fn numbers(&self, name: usize) -> Vec<f64> {
+        let mut numbers = Vec::new();
+        self.said.numbers(&self.names[name].0, &mut |number| numbers.push(number));
+        numbers
+    }
+
+    fn has(&self, name: usize) -> Option<bool> {
+        self.said.has(&self.names[name].0)
+    }
+
+    fn is_text(&self, name: usize, text: &str) -> Option<bool> {
+        self.said.is_text(&self.names[name].0, text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Source, dbc};
+    use cantap_trace::{Direction, TraceEvent};
+
+    const DATABASE: &str = "BO_ 1 Engine: 8 A\n SG_ Speed : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ F : 32|32@1+ (1,0) [0|0] \"\" A\n\
+        BO_ 2 Box: 8 A\n SG_ Gear : 0|8@1+ (1,0) [0|0] \"\" A\n SG_ Speed : 8|8@1+ (1,0) [0|0] \"\" A\n\
+        VAL_ 2 Gear 3 \"Drive\" 0 \"Not available\" ;\nSIG_VALTYPE_ 1 F : 1;\n";
+
+    fn decoder() -> Decoder {
+        let database = dbc::parse("x.dbc", DATABASE.as_bytes()).unwrap();
+        Decoder::new(vec![Source { channel: None, database }])
+    }
+
+    fn record(event: TraceEvent) -> TraceRecord {
+        TraceRecord { time_ns: 0, channel: 1, event }
+    }
+
+    fn frame(text: &str) -> TraceRecord {
+        record(TraceEvent::Frame { frame: text.parse().unwrap(), direction: Direction::Rx, late: false })
+    }
+
+    /// At which of the frames the condition holds.
+    fn hits(condition: &str, frames: &[&str]) -> Vec<usize> {
+        let mut condition = Condition::new(condition, &decoder()).unwrap();
+        (0..frames.len()).filter(|&at| condition.holds(&frame(frames[at]))).collect()
+    }
+
+    const FRAMES: &[&str] = &["002#0350", "001#51", "123#80", "001#50", "002#00", "001#60", "001#"];
+
+    #[test]
+    fn signals_of_several_messages_keep_their_last_value() {
+        assert_eq!(hits("Engine.Speed > 80 and Gear == 3", FRAMES), [1]);
+        assert_eq!(hits("Engine.Speed > 80 and Gear == Drive", FRAMES), [1]);
+        assert_eq!(hits("'Not available' == Gear and Engine.Speed == 0x60", FRAMES), [5]);
+        assert_eq!(hits("Gear != drive", FRAMES), [4]);
+        assert_eq!(hits("Speed == 80", FRAMES), [0, 3], "of either message, the last one");
+        assert_eq!(hits("not Engine.Speed > 80", FRAMES), [3], "before the first frame it is not known");
+    }
+
+    #[test]
+    fn parts_of_the_frame_are_looked_at_for_every_record() {
+        assert_eq!(hits("id == 0x123 and byte[0] & 0x80 and ch == 1", FRAMES), [2]);
+        assert_eq!(hits("byte[1] != 0", FRAMES), [0], "a byte that is not there is neither equal nor not");
+        assert_eq!(hits("len == 0 or byte[0] / 2 > 0x30", FRAMES), [2, 6]);
+        assert_eq!(hits("ext or rtr", &["00000001#", "001#R", "001#"]), [0, 1]);
+        assert_eq!(hits("dlc == 9", &["001#1122334455667788_9"]), [0]);
+        assert_eq!(hits("byte[0 - len] == 1 or byte[len / 2] == 1", &["001#01"]), [] as [usize; 0]);
+        assert_eq!(
+            hits("byte[0] / (len - 1) > 1 or byte[0] % (len - 1) >= 0", &["001#02"]),
+            [] as [usize; 0]
+        );
+    }
+
+    #[test]
+    fn errors_and_losses_can_be_waited_for() {
+        let mut condition = Condition::new("error or lost", &Decoder::new(Vec::new())).unwrap();
+        assert!(condition.holds(&record(TraceEvent::BusError { kind: None, counters: None })));
+        assert!(condition.holds(&record(TraceEvent::Lost { stage: None, count: 1, at_least: false })));
+        assert!(!condition.holds(&frame("001#")));
+    }
+
+    #[test]
+    fn not_a_number_is_unknown() {
+        let nan = &["001#000000000000C07F"];
+        assert_eq!(hits("F == F or F != F or not F or F", nan), [] as [usize; 0]);
+        assert_eq!(hits("F > 1 or Speed == 0", nan), [0]);
+        assert_eq!(hits("Speed / 0 > 1 or Speed % 0 == 0", &["001#01"]), [] as [usize; 0]);
+    }
+
+    #[test]
+    fn names_that_are_nothing_are_explained() {
+        for (text, expected) in [
+            ("Sped > 1", "there is no signal \"Sped\"; did you mean Speed?\n  Sped > 1\n  ^"),
+            (
+                "Gear == Driv",
+                "Gear has no value \"Driv\"; it has Not available, Drive\n  Gear == Driv\n          ^",
+            ),
+            ("Engine.Speed == Fast", "Engine.Speed has no value \"Fast\"\n"),
+            (
+                "byte[-1] == 1",
+                "a frame has no byte -1; bytes are counted from 0 to 7, in CAN FD to 63\n  byte[-1] == 1\n       ^",
+            ),
+            ("byte[1 + 0.5] == 1", "a frame has no byte 1.5; "),
+            ("byte[64] == 1", "a frame has no byte 64; "),
+            ("'Drive' > 1", "a text can only be compared with a signal, by == or !=\n  'Drive' > 1\n  ^"),
+        ] {
+            let error = Condition::new(text, &decoder()).unwrap_err().to_string();
+            assert!(error.starts_with(expected), "{error}");
+        }
+        let error = Condition::new("Speed > 1", &Decoder::new(Vec::new())).unwrap_err().to_string();
+        assert!(error.contains("without a database there are no signals\n"), "{error}");
+    }
+}

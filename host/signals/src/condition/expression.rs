@@ -1,0 +1,130 @@
+//! What a condition is made of once its names are bound, and its arithmetic.
+
+use crate::MessageRef;
+use cantap_trace::fd::FD_MAX_BYTES;
+use cantap_trace::{TraceEvent, TraceRecord};
+
+use super::syntax::Operator;
+
+/// A signal that the condition names. The same name may stand for signals of several messages.
+#[derive(Clone, Debug)]
+pub(super) struct Slot {
+    pub(super) name: String,
+    pub(super) candidates: Vec<(MessageRef, u32)>,
+    /// The last value: which candidate, raw and physical.
+    pub(super) last: Option<(usize, u64, f64)>,
+}
+
+#[derive(Clone, Debug)]
+pub(super) enum Expression {
+    Number(f64),
+    Part(Part),
+    Byte(Box<Expression>),
+    Signal(usize),
+    /// Whether a signal's value has a text: for each candidate the raw values with that text.
+    HasText(usize, Vec<Vec<i64>>),
+    /// The first value of a listener's name, by its place among the names.
+    Said(usize),
+    /// Whether there is a value of it.
+    IsSaid(usize),
+    /// Whether one of its values compares so with the other side; `true` if the name is on the left.
+    AnySaid(usize, Operator, Box<Expression>, bool),
+    /// Whether one of its values is this text.
+    SaidText(usize, String),
+    Not(Box<Expression>),
+    Negative(Box<Expression>),
+    Binary(Operator, Box<Expression>, Box<Expression>),
+}
+
+#[derive(Clone, Copy, Debug)]
+pub(super) enum Part {
+    Id,
+    Channel,
+    Dlc,
+    Length,
+    Extended,
+    Remote,
+    Error,
+    Lost,
+}
+
+pub(super) fn part(name: &str) -> Option<Part> {
+    Some(match name.to_ascii_lowercase().as_str() {
+        "id" => Part::Id,
+        "ch" | "channel" => Part::Channel,
+        "dlc" => Part::Dlc,
+        "len" => Part::Length,
+        "ext" => Part::Extended,
+        "rtr" => Part::Remote,
+        "error" => Part::Error,
+        "lost" => Part::Lost,
+        _ => return None,
+    })
+}
+
+pub(super) fn part_of(part: Part, record: &TraceRecord) -> Option<f64> {
+    let flag = |flag: bool| Some(f64::from(u8::from(flag)));
+    match part {
+        Part::Channel => return Some(record.channel.into()),
+        Part::Error => return flag(matches!(record.event, TraceEvent::BusError { .. })),
+        Part::Lost => return flag(matches!(record.event, TraceEvent::Lost { .. })),
+        _ => {}
+    }
+    let frame = record.frame()?;
+    match part {
+        Part::Id => Some(frame.id().raw().into()),
+        Part::Dlc => Some(frame.dlc().into()),
+        Part::Length => Some(frame.data_len() as f64),
+        Part::Extended => flag(frame.id().is_extended()),
+        Part::Remote => flag(frame.is_remote()),
+        Part::Channel | Part::Error | Part::Lost => None,
+    }
+}
+
+/// The value of what depends on no record.
+pub(super) fn constant(expression: &Expression) -> Option<f64> {
+    match expression {
+        Expression::Number(value) => Some(*value),
+        Expression::Negative(inner) => constant(inner).map(|value| -value),
+        Expression::Binary(operator, left, right) => binary(*operator, constant(left)?, constant(right)?),
+        _ => None,
+    }
+}
+
+/// The place of a data byte, if there can be a byte at it.
+pub(super) fn byte_index(value: f64) -> Option<usize> {
+    const MOST: f64 = (FD_MAX_BYTES - 1) as f64;
+    (value.fract() == 0.0 && (0.0..=MOST).contains(&value)).then_some(value as usize)
+}
+
+/// Not-a-number is as unknown as nothing at all.
+pub(super) fn truth(value: Option<f64>) -> Option<bool> {
+    value.filter(|value| !value.is_nan()).map(|value| value != 0.0)
+}
+
+#[expect(clippy::float_cmp, reason = "a user who writes == means it")]
+pub(super) fn binary(operator: Operator, left: f64, right: f64) -> Option<f64> {
+    if left.is_nan() || right.is_nan() {
+        return None;
+    }
+    let boolean = |truth: bool| Some(f64::from(u8::from(truth)));
+    match operator {
+        // Decided before, unless both are true or both are false.
+        Operator::And => boolean(true),
+        Operator::Or => boolean(false),
+        Operator::Equal => boolean(left == right),
+        Operator::NotEqual => boolean(left != right),
+        Operator::Less => boolean(left < right),
+        Operator::LessOrEqual => boolean(left <= right),
+        Operator::Greater => boolean(left > right),
+        Operator::GreaterOrEqual => boolean(left >= right),
+        Operator::BitOr => Some((left as i64 | right as i64) as f64),
+        Operator::BitAnd => Some((left as i64 & right as i64) as f64),
+        Operator::Add => Some(left + right),
+        Operator::Subtract => Some(left - right),
+        Operator::Multiply => Some(left * right),
+        Operator::Divide | Operator::Remainder if right == 0.0 => None,
+        Operator::Divide => Some(left / right),
+        Operator::Remainder => Some(left % right),
+    }
+}

@@ -61,6 +61,8 @@ const HELLO_TRIES: u32 = 3;
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 /// Round trips that set the clock at the start.
 const CLOCK_ROUNDS: u32 = 8;
+/// No clock of a device is slower: a tick is a microsecond at most, and the fastest bit is one.
+const LEAST_CLOCK_HZ: u32 = 1_000_000;
 /// A closing channel's last records are given up when none has come for this long.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 /// Transmissions that a subscriber may leave waiting.
@@ -123,7 +125,7 @@ impl Device {
             // The zero ends whatever stands in the device's input, and chooses our language over slcan.
             self.shared.write(&[0])?;
             match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
-                Ok(Reply::Hello(hello)) => return Ok(hello),
+                Ok(Reply::Hello(hello)) => return believe(hello),
                 Ok(_) => return Err(DeviceError::WrongReply),
                 Err(DeviceError::Timeout { .. }) => {}
                 Err(error) => return Err(error),
@@ -187,6 +189,17 @@ impl Device {
             self.set_bit_length(channel, config);
         }
         match self.request(Command::Open { channel, config })? {
+            Reply::Opened(applied)
+                if !applied.timing.is_valid()
+                    || config.is_some_and(|asked| {
+                        (asked.timing, asked.mode) != (applied.timing, applied.mode)
+                    }) =>
+            {
+                // It may acknowledge, or destroy frames at a wrong bit rate.
+                self.done(Command::Close { channel })?;
+                let bitrate_bps = applied.timing.bitrate_bps(self.hello.can_clock_hz);
+                Err(DeviceError::OpenedOtherwise { channel, bitrate_bps, mode: applied.mode })
+            }
             Reply::Opened(applied) => {
                 self.set_bit_length(channel, &applied);
                 self.settings().open[channel.index()] = Some(applied);
@@ -347,6 +360,18 @@ impl Drop for Device {
             let _ = thread.join();
         }
     }
+}
+
+/// Times and bit rates are made of what a device says of its clocks, so nothing can be right if these cannot.
+fn believe(hello: Hello) -> Result<Hello, DeviceError> {
+    let what = match &hello {
+        Hello { tick_hz: ..LEAST_CLOCK_HZ, .. } => format!("its clock ticks at {} Hz", hello.tick_hz),
+        Hello { can_clock_hz: ..LEAST_CLOCK_HZ, .. } => {
+            format!("its CAN controller's clock is {} Hz", hello.can_clock_hz)
+        }
+        _ => return Ok(hello),
+    };
+    Err(DeviceError::Impossible { what })
 }
 
 /// Stands in while there is no answer yet.

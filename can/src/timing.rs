@@ -82,7 +82,7 @@ impl BitTiming {
         self.prescaler as u32 * self.quanta()
     }
 
-    /// The bit rate in bit/s, rounded; zero of a timing that is not valid because its prescaler is zero.
+    /// The bit rate in bit/s, rounded.
     pub const fn bitrate_bps(&self, clock_hz: u32) -> u32 {
         rate_of(clock_hz, self.clocks_per_bit())
     }
@@ -176,8 +176,7 @@ impl BitTiming {
 
 /// The bit rate of a bit that is `clocks` controller clocks long, rounded to whole bit/s.
 const fn rate_of(clock_hz: u32, clocks: u32) -> u32 {
-    // A device may say anything of itself.
-    if clocks == 0 { 0 } else { clock_hz.saturating_add(clocks / 2) / clocks }
+    (clock_hz + clocks / 2) / clocks
 }
 
 #[cfg(test)]

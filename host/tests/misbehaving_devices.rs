@@ -180,7 +180,7 @@ fn what_a_device_says_of_itself_and_cannot_be_is_refused() {
     for (says, words) in [
         (Hello { tick_hz: 0, ..hello() }, "its clock ticks at 0 Hz"),
         (Hello { tick_hz: 999_999, ..hello() }, "its clock ticks at 999999 Hz"),
-        (Hello { can_clock_hz: 0, ..hello() }, "its CAN controller's clock is 0 Hz"),
+        (Hello { can_clock_hz: 0, ..hello() }, "its CAN controllers' clock is 0 Hz"),
     ] {
         let (link, mut fake) = FakeDevice::new();
         fake.says = says;
@@ -195,7 +195,7 @@ fn what_a_device_says_of_itself_and_cannot_be_is_refused() {
     for (opens, words) in [
         (slower, "channel 1 at 250000 bit/s in the mode ListenOnly"),
         (ChannelConfig { mode: Mode::Normal, ..listening }, "channel 1 at 500000 bit/s in the mode Normal"),
-        (ChannelConfig { timing: none, ..listening }, "channel 1 at 0 bit/s"),
+        (ChannelConfig { timing: none, ..listening }, "a bit timing that is out of its controller's range"),
     ] {
         let (link, mut fake) = FakeDevice::new();
         fake.opens = Some(opens);

@@ -12,6 +12,7 @@ mod error;
 mod intake;
 mod link;
 mod pipe;
+mod plausible;
 mod reader;
 mod reconnect;
 #[cfg(feature = "serial")]
@@ -49,6 +50,7 @@ pub use stamps::{BitLengths, tighten};
 pub use watch::{Next, SilenceWatch};
 
 use crate::TraceRecord;
+use plausible::believe;
 use reader::{Answer, Order, Shared};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
@@ -61,8 +63,6 @@ const HELLO_TRIES: u32 = 3;
 const HELLO_TIMEOUT: Duration = Duration::from_millis(700);
 /// Round trips that set the clock at the start.
 const CLOCK_ROUNDS: u32 = 8;
-/// No clock of a device is slower: a tick is a microsecond at most, and the fastest bit is one.
-const LEAST_CLOCK_HZ: u32 = 1_000_000;
 /// A closing channel's last records are given up when none has come for this long.
 const DRAIN_TIMEOUT: Duration = Duration::from_secs(1);
 /// Transmissions that a subscriber may leave waiting.
@@ -125,7 +125,7 @@ impl Device {
             // The zero ends whatever stands in the device's input, and chooses our language over slcan.
             self.shared.write(&[0])?;
             match self.request_within(Command::Hello { protocol: PROTOCOL_VERSION }, HELLO_TIMEOUT) {
-                Ok(Reply::Hello(hello)) => return believe(hello),
+                Ok(Reply::Hello(hello)) => return Ok(hello),
                 Ok(_) => return Err(DeviceError::WrongReply),
                 Err(DeviceError::Timeout { .. }) => {}
                 Err(error) => return Err(error),
@@ -190,10 +190,8 @@ impl Device {
         }
         match self.request(Command::Open { channel, config })? {
             Reply::Opened(applied)
-                if !applied.timing.is_valid()
-                    || config.is_some_and(|asked| {
-                        (asked.timing, asked.mode) != (applied.timing, applied.mode)
-                    }) =>
+                if config
+                    .is_some_and(|asked| (asked.timing, asked.mode) != (applied.timing, applied.mode)) =>
             {
                 // It may acknowledge, or destroy frames at a wrong bit rate.
                 self.done(Command::Close { channel })?;
@@ -362,18 +360,6 @@ impl Drop for Device {
     }
 }
 
-/// Times and bit rates are made of what a device says of its clocks, so nothing can be right if these cannot.
-fn believe(hello: Hello) -> Result<Hello, DeviceError> {
-    let what = match &hello {
-        Hello { tick_hz: ..LEAST_CLOCK_HZ, .. } => format!("its clock ticks at {} Hz", hello.tick_hz),
-        Hello { can_clock_hz: ..LEAST_CLOCK_HZ, .. } => {
-            format!("its CAN controller's clock is {} Hz", hello.can_clock_hz)
-        }
-        _ => return Ok(hello),
-    };
-    Err(DeviceError::Impossible { what })
-}
-
 /// Stands in while there is no answer yet.
 fn no_hello() -> Hello {
     Hello {
@@ -409,10 +395,11 @@ impl Pending<'_> {
 
     fn wait_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
         match self.answers.recv_timeout(timeout) {
-            Ok(Answer::Response(response)) => response.result.map_err(|refusal| match refusal {
-                Refusal::Protocol { device } => DeviceError::Protocol { device },
-                refusal => DeviceError::Refused { refusal },
-            }),
+            Ok(Answer::Response(response)) => match response.result {
+                Ok(reply) => believe(reply),
+                Err(Refusal::Protocol { device }) => Err(DeviceError::Protocol { device }),
+                Err(refusal) => Err(DeviceError::Refused { refusal }),
+            },
             Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
             Err(_) => {
                 Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))

@@ -150,4 +150,14 @@ fn decoded_signals_go_to_a_file_of_their_form() {
         assert_eq!(cantap(folder, &format!("decode --db car.dbc a.log -o {name}")), "");
         assert_eq!(fs::read_to_string(folder.join(name)).unwrap(), said, "{name}");
     }
+    // Lines of text would pass for something else under such a name.
+    for name in ["a.mf4", "a.xlsx", "a.blf", "a.foo"] {
+        let arguments = format!("decode --db car.dbc a.log -o {name}");
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+        let output = command.args(arguments.split_whitespace()).current_dir(folder).output().unwrap();
+        let err = String::from_utf8(output.stderr).unwrap();
+        assert_eq!(output.status.code(), Some(2), "{name}: {err}");
+        assert!(err.contains("does not tell the form") && err.contains(".csv"), "{name}: {err}");
+        assert!(!folder.join(name).exists(), "{name}");
+    }
 }

@@ -1,4 +1,4 @@
-//! The documents' pictures of the live view, made by the command from a recorded bus, and `--once` as scripts use it.
+//! The documents' pictures, made by the command from recorded buses, and the live view's `--once` as scripts use it.
 //!
 //! After a change that is meant, write them anew with `CANTAP_OVERWRITE=1 cargo test -p cantap-cli --test
 //! monitor_screens` and look at them.
@@ -6,6 +6,8 @@
 use std::path::Path;
 use std::process::{Command, Output};
 
+/// Half a minute of `virtual:car`, recorded.
+const DRIVE: &str = "docs/screens/drive.log.xz";
 const BOAT: &str = "monitor host/formats/tests/data/nmea2000.log.gz -p docs/screens/boat.toml --once";
 
 fn cantap(arguments: &str) -> (Option<i32>, String, String) {
@@ -20,12 +22,26 @@ fn cantap(arguments: &str) -> (Option<i32>, String, String) {
 fn the_pictures_in_the_documents_are_what_the_command_draws() {
     let documents = Path::new(env!("CARGO_MANIFEST_DIR")).join("../docs/screens");
     let folder = tempfile::tempdir().unwrap();
-    for (page, size) in [("fixed", "100x20"), ("graph", "100x24")] {
-        let drawn = folder.path().join(page);
-        let line = format!("{BOAT} --view {page} --size {size} --svg {}", drawn.display());
-        assert_eq!(cantap(&line), (Some(0), String::new(), String::new()));
+    let monitor = format!("monitor {DRIVE} -p docs/screens/car.toml --once");
+    for (name, command) in [
+        ("fixed", format!("{monitor} --view fixed --size 132x24 --svg")),
+        ("graph", format!("{monitor} --view graph --size 100x26 --svg")),
+        (
+            "plot",
+            format!(
+                "plot {DRIVE} --db host/virtual/src/car/car.dbc -s EngineSpeed -s VehicleSpeed -s CurrentGear -s AcceleratorPedal -o"
+            ),
+        ),
+    ] {
+        let drawn = folder.path().join(format!("{name}.svg"));
+        let line = format!("{command} {}", drawn.display());
+        let (code, out, err) = cantap(&line);
+        assert!(
+            code == Some(0) && out.is_empty() && (name == "plot" || err.is_empty()),
+            "{line}: {out}{err}"
+        );
         let drawn = std::fs::read_to_string(drawn).unwrap();
-        let document = documents.join(format!("{page}.svg"));
+        let document = documents.join(format!("{name}.svg"));
         if std::env::var_os("CANTAP_OVERWRITE").is_some() {
             std::fs::write(&document, &drawn).unwrap();
         }

@@ -24,8 +24,8 @@ use crate::{Device, DeviceError};
 
 /// Frames that the controller has to hear.
 const GOOD_FRAMES: u32 = 4;
-/// With fewer, an answer is given after this time.
-const ANSWER_AFTER: Duration = Duration::from_secs(1);
+/// With fewer, an answer is given after this time, so that it is there within a second.
+const ANSWER_AFTER: Duration = Duration::from_millis(900);
 /// The controller listens for at least this long if it hears nothing.
 const LISTEN: Duration = Duration::from_millis(100);
 /// The same where two frames were read bit by bit: they prove the bit rate, so only errors could still contradict it.

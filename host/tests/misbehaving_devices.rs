@@ -12,8 +12,9 @@ use std::time::{Duration, Instant};
 use cantap::device::{ChannelCounters, Happening, Reconnecting, Return};
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::wire::record::LossStage;
+use cantap::wire::{BitTiming, Hello};
 use cantap::{Channel, Device, DeviceError, TraceEvent, TraceRecord};
-use fake_device::{FakeDevice, Fault, Log};
+use fake_device::{FakeDevice, Fault, Log, hello};
 
 /// Nothing here takes this long, however busy the machine is.
 const PATIENCE: Duration = Duration::from_mins(1);
@@ -115,6 +116,8 @@ fn whatever_ends_a_session_is_said_and_the_capture_goes_on_with_the_gap_in_place
         (Fault::SessionLost, "this computer slept, or the device was restarted"),
         (Fault::Stolen, "another program took it over; close that program"),
         (Fault::GoesBack, "its stream began anew"),
+        (Fault::SetBack, "its times contradict one another"),
+        (Fault::TimeBehind, "its times contradict one another"),
         (Fault::Vanishes, "the device at 'fake' vanished (the connection was closed)"),
     ] {
         let log = Arc::default();
@@ -142,8 +145,13 @@ fn whatever_ends_a_session_is_said_and_the_capture_goes_on_with_the_gap_in_place
         assert_eq!(counted.iter().map(ChannelCounters::delivered).sum::<u64>(), frames as u64, "{fault:?}");
         // What the device could tell of is counted: the batch that was lost before it ended the session.
         let lost: Vec<u64> = counted.iter().map(|channel| channel.lost_link).collect();
-        let says_so = matches!(fault, Fault::Suspended | Fault::Configured);
-        assert_eq!(lost, [u64::from(says_so); 2], "{fault:?}");
+        if fault == Fault::SetBack {
+            // What arrived with a time that cannot be.
+            assert!(lost.iter().all(|lost| (1..50).contains(lost)), "{lost:?}");
+        } else {
+            let says_so = matches!(fault, Fault::Suspended | Fault::Configured);
+            assert_eq!(lost, [u64::from(says_so); 2], "{fault:?}");
+        }
         // Both channels were opened as they had been, in the mode that was asked for.
         let opened = log.lock().unwrap().opened.clone();
         assert_eq!((opened.len(), &opened[..2]), (4, &opened[2..]), "{fault:?}");
@@ -163,6 +171,44 @@ fn what_only_looks_bad_ends_no_session_and_loses_nothing() {
             assert_eq!(line.counters().channels[channel.index()].lost(), 0, "{fault:?}");
         }
         assert_eq!(line.counters().corrupt > 0, fault != Fault::Slow, "{fault:?}");
+    }
+}
+
+/// Stamps, loads and bit rates would all be wrong, and a mode may disturb the bus.
+#[test]
+fn what_a_device_says_of_itself_and_cannot_be_is_refused() {
+    for (says, words) in [
+        (Hello { tick_hz: 0, ..hello() }, "its clock ticks at 0 Hz"),
+        (Hello { tick_hz: 999_999, ..hello() }, "its clock ticks at 999999 Hz"),
+        (Hello { can_clock_hz: 0, ..hello() }, "its CAN controllers' clock is 0 Hz"),
+    ] {
+        let (link, mut fake) = FakeDevice::new();
+        fake.says = says;
+        let thread = std::thread::spawn(move || fake.run(Fault::None, BEFORE));
+        let Err(error) = Device::over(link, "fake") else { panic!("{words}: accepted") };
+        assert!(error.to_string().contains(words), "{error}");
+        thread.join().unwrap();
+    }
+    let listening = ChannelConfig::listen_only(BitTiming::choose(36_000_000, 500_000, None).unwrap());
+    let slower = ChannelConfig::listen_only(BitTiming::choose(36_000_000, 250_000, None).unwrap());
+    let none = BitTiming { prescaler: 0, ..listening.timing };
+    for (opens, words) in [
+        (slower, "channel 1 at 250000 bit/s in the mode ListenOnly"),
+        (ChannelConfig { mode: Mode::Normal, ..listening }, "channel 1 at 500000 bit/s in the mode Normal"),
+        (ChannelConfig { timing: none, ..listening }, "a bit timing that is out of its controller's range"),
+    ] {
+        let (link, mut fake) = FakeDevice::new();
+        fake.opens = Some(opens);
+        let thread = std::thread::spawn(move || {
+            fake.run(Fault::None, BEFORE);
+            fake
+        });
+        let device = Device::over(link, "fake").unwrap();
+        let error = device.open_channel(Channel::Can1, Some(listening)).unwrap_err();
+        assert!(error.to_string().contains(words), "{error}");
+        assert!(device.open_channels().is_empty());
+        drop(device);
+        assert_eq!(thread.join().unwrap().status.channels[0].open, None, "it was closed again");
     }
 }
 

@@ -3,7 +3,7 @@
 use std::time::Duration;
 use std::{fmt, io};
 
-use cantap_wire::message::{MAX_FILTERS, MAX_SEND, Refusal};
+use cantap_wire::message::{MAX_FILTERS, MAX_SEND, Mode, Refusal};
 use cantap_wire::timing::{MAX_BITRATE_BPS, MIN_BITRATE_BPS, NoTiming};
 use cantap_wire::{Channel, PROTOCOL_VERSION};
 
@@ -131,6 +131,25 @@ pub enum DeviceError {
         /// Why not, and what is near.
         reason: NoTiming,
     },
+    /// What the device says of itself cannot be.
+    #[error("the device says {what}, which cannot be; update its firmware")]
+    Impossible {
+        /// What it says.
+        what: String,
+    },
+    /// The device opened a channel in another way than it was asked to. It was closed again.
+    #[error(
+        "the device opened channel {} at {bitrate_bps} bit/s in the mode {mode:?}, which is not what it was asked for; update its firmware",
+        .channel.number()
+    )]
+    OpenedOtherwise {
+        /// Which.
+        channel: Channel,
+        /// The bit rate it tells, in bit/s.
+        bitrate_bps: u32,
+        /// The mode it tells.
+        mode: Mode,
+    },
     /// The device has fewer channels.
     #[error("the device has no channel {}", .channel.number())]
     NoChannel {
@@ -156,6 +175,8 @@ pub enum SessionOver {
     Greeted,
     /// The stream begins anew.
     StreamWentBack,
+    /// The device's clock was set back, or its records are later than it says it is.
+    TimesDisagree,
     /// The board's server has lost it.
     BoardLost,
     /// The board's server has ended.
@@ -183,6 +204,9 @@ impl fmt::Display for SessionOver {
             Self::Greeted => "another program took it over; close that program",
             Self::StreamWentBack => {
                 "its stream began anew, because another program took it over or it was restarted"
+            }
+            Self::TimesDisagree => {
+                "its times contradict one another, so its last stamps may be wrong; if that stays so, update its firmware"
             }
             Self::BoardLost => "its server has lost the board",
             Self::ServerEnded => "its server has ended",

@@ -15,6 +15,9 @@ use crate::{Direction, TraceEvent, TraceRecord};
 /// Bytes decoded at a time: their records stay in the processor's cache through every pass.
 pub const PIECE_BYTES: usize = 4096;
 
+/// A device's times are in order but for a tenth of a second: a mark of USB is up to a millisecond older than the record in front of it.
+const DISORDER_PER_S: u64 = 10;
+
 /// What was received and lost on one channel since the session began.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct ChannelCounters {
@@ -106,6 +109,8 @@ pub enum Notice {
     Stopped(Channel),
     /// The stream has begun anew: the session is not ours any more.
     WentBack,
+    /// The device's times contradict one another: its stamps are not to be trusted.
+    TimesDisagree,
     /// The device has ended the session.
     Ended {
         /// From when on nothing was captured, in UTC nanoseconds since the Unix epoch.
@@ -131,6 +136,8 @@ pub struct Intake {
     counters: Counters,
     /// Device time of the latest record, in ticks.
     latest_ticks: u64,
+    /// By how much a time may be before one that stands in front of it, in ticks.
+    disorder_ticks: u64,
     /// `Hello` was answered; what came before belongs to another program's session.
     in_session: bool,
 }
@@ -149,6 +156,7 @@ impl Intake {
             last_ns: i64::MIN,
             counters: Counters::default(),
             latest_ticks: 0,
+            disorder_ticks: u64::MAX,
             in_session: false,
         }
     }
@@ -167,8 +175,10 @@ impl Intake {
             last_ns,
             utc,
             latest_ticks,
+            disorder_ticks,
         } = self;
         let mut last_ticks = None;
+        let mut disagree = false;
         let mut ended = None;
         counters.bytes += bytes.len() as u64;
         decoder.push(bytes, |decoded| match decoded {
@@ -207,10 +217,16 @@ impl Intake {
                     records.clear();
                     last_ticks = None;
                     *latest_ticks = 0;
+                    *disorder_ticks = u64::from(answer.tick_hz) / DISORDER_PER_S;
                     *counters = Counters::default();
                     *lengths = BitLengths::default();
                     *last_ns = i64::MIN;
                     *clock = ClockMap::new(answer.tick_hz, utc.at(Instant::now()));
+                }
+                // Whatever stands in front of it had happened by then.
+                if let (Ok(Reply::Time(now)), true) = (&response.result, *in_session) {
+                    let latest = last_ticks.unwrap_or(0).max(*latest_ticks);
+                    disagree |= latest.saturating_sub(*now) > *disorder_ticks;
                 }
                 notice(Notice::Response(response.clone()));
             }
@@ -227,12 +243,36 @@ impl Intake {
             }
             Decoded::OtherProtocol(version) => notice(Notice::OtherProtocol(version)),
         });
-        *latest_ticks = (*latest_ticks).max(last_ticks.unwrap_or(0));
+        let went_back = last_ticks.is_some_and(|last| latest_ticks.saturating_sub(last) > *disorder_ticks);
+        if went_back {
+            self.withhold();
+        } else {
+            *latest_ticks = (*latest_ticks).max(last_ticks.unwrap_or(0));
+        }
+        if went_back || disagree {
+            notice(Notice::TimesDisagree);
+        }
         self.place_in_time();
         if let Some((ticks, reason)) = ended {
             notice(Notice::Ended { time_ns: self.clock.utc(Ticks(ticks)).0, reason });
         }
         &mut self.records
+    }
+
+    /// Counts the new frames as lost: nobody knows when they were.
+    fn withhold(&mut self) {
+        let at = Ticks(self.latest_ticks);
+        let mut frames = [0; CHANNELS];
+        for stamped in self.stamped.drain(..) {
+            let is_received = matches!(stamped.event, TraceEvent::Frame { direction: Direction::Rx, .. });
+            frames[usize::from(stamped.channel == 2)] += u32::from(is_received);
+        }
+        for (channel, count) in Channel::ALL.into_iter().zip(frames) {
+            let counters = &mut self.counters.channels[channel.index()];
+            counters.received -= u64::from(count);
+            counters.lost_link += u64::from(count);
+            self.stamped.extend(lost(channel, at, LossStage::Link, count, false));
+        }
     }
 
     /// Tightens the new records, maps them to UTC and puts them in order. A channel whose stamps were moved

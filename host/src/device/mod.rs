@@ -12,6 +12,7 @@ mod error;
 mod intake;
 mod link;
 mod pipe;
+mod plausible;
 mod reader;
 mod reconnect;
 #[cfg(feature = "serial")]
@@ -49,6 +50,7 @@ pub use stamps::{BitLengths, tighten};
 pub use watch::{Next, SilenceWatch};
 
 use crate::TraceRecord;
+use plausible::believe;
 use reader::{Answer, Order, Shared};
 
 /// Records that wait for a consumer: 32 MB, half a minute of two saturated channels.
@@ -187,6 +189,15 @@ impl Device {
             self.set_bit_length(channel, config);
         }
         match self.request(Command::Open { channel, config })? {
+            Reply::Opened(applied)
+                if config
+                    .is_some_and(|asked| (asked.timing, asked.mode) != (applied.timing, applied.mode)) =>
+            {
+                // It may acknowledge, or destroy frames at a wrong bit rate.
+                self.done(Command::Close { channel })?;
+                let bitrate_bps = applied.timing.bitrate_bps(self.hello.can_clock_hz);
+                Err(DeviceError::OpenedOtherwise { channel, bitrate_bps, mode: applied.mode })
+            }
             Reply::Opened(applied) => {
                 self.set_bit_length(channel, &applied);
                 self.settings().open[channel.index()] = Some(applied);
@@ -384,10 +395,11 @@ impl Pending<'_> {
 
     fn wait_within(self, timeout: Duration) -> Result<Reply, DeviceError> {
         match self.answers.recv_timeout(timeout) {
-            Ok(Answer::Response(response)) => response.result.map_err(|refusal| match refusal {
-                Refusal::Protocol { device } => DeviceError::Protocol { device },
-                refusal => DeviceError::Refused { refusal },
-            }),
+            Ok(Answer::Response(response)) => match response.result {
+                Ok(reply) => believe(reply),
+                Err(Refusal::Protocol { device }) => Err(DeviceError::Protocol { device }),
+                Err(refusal) => Err(DeviceError::Refused { refusal }),
+            },
             Ok(Answer::OtherProtocol(device)) => Err(DeviceError::Protocol { device }),
             Err(_) => {
                 Err(self.shared.gone().unwrap_or(DeviceError::Timeout { seconds: timeout.as_secs_f32() }))

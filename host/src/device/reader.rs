@@ -285,6 +285,7 @@ pub(super) fn run(mut port: Box<dyn Read + Send>, shared: &Arc<Shared>, orders: 
                 Notice::Stopped(channel) => published.stopped[channel.index()] += 1,
                 Notice::Transmission(transmission) => report(shared, transmission),
                 Notice::WentBack => heard.end = heard.end.or(Some(SessionOver::StreamWentBack)),
+                Notice::TimesDisagree => heard.end = heard.end.or(Some(SessionOver::TimesDisagree)),
                 Notice::Ended { time_ns, reason } => {
                     published.ended_ns = Some(time_ns);
                     heard.end = Some(match reason {

@@ -47,6 +47,10 @@ pub enum Fault {
     Slow,
     /// The record that ends a channel never comes.
     NeverStops,
+    /// Its clock is a second behind where it was.
+    SetBack,
+    /// It says that it is a second earlier than its records.
+    TimeBehind,
     /// The port is gone.
     Vanishes,
 }
@@ -78,6 +82,12 @@ pub struct FakeDevice {
     pub status: Status,
     pub serial: String,
     started: Instant,
+    set_back: u64,
+    time_behind: u64,
+    /// What it answers to `Open`, if that is not what it was asked for.
+    pub opens: Option<ChannelConfig>,
+    /// What it says of itself.
+    pub says: Hello,
     /// No request of this host has this number.
     strangers_id: u16,
     log: Arc<Mutex<Log>>,
@@ -138,6 +148,10 @@ impl FakeDevice {
             status,
             serial: "0001".to_owned(),
             started: Instant::now(),
+            set_back: 0,
+            time_behind: 0,
+            opens: None,
+            says: hello(),
             strangers_id: 0,
             log: Arc::default(),
         }
@@ -238,12 +252,14 @@ impl FakeDevice {
         self.batch.finish(&mut [0; MAX_ENCODED]);
     }
 
+    /// It has run for ten seconds when it is opened.
     fn ticks(&self) -> u64 {
-        (self.started.elapsed().as_nanos() * u128::from(TICK_HZ) / 1_000_000_000) as u64
+        let ran = self.started.elapsed() + Duration::from_secs(10);
+        (ran.as_nanos() * u128::from(TICK_HZ) / 1_000_000_000) as u64 - self.set_back
     }
 
     fn hello(&self) -> Hello {
-        Hello { serial: self.serial.as_str().try_into().unwrap(), ..hello() }
+        Hello { serial: self.serial.as_str().try_into().unwrap(), ..self.says.clone() }
     }
 
     fn begin_session(&mut self) {
@@ -258,12 +274,12 @@ impl FakeDevice {
                 self.begin_session();
                 Ok(Reply::Hello(self.hello()))
             }
-            Command::Time => Ok(Reply::Time(self.ticks())),
+            Command::Time => Ok(Reply::Time(self.ticks() - self.time_behind)),
             Command::Status => Ok(Reply::Status(self.status.clone())),
             &Command::Open { channel, config: Some(config) } => {
                 self.status.channels[channel.index()].open = Some(config);
                 self.log.lock().unwrap().opened.push((channel, config));
-                Ok(Reply::Opened(config))
+                Ok(Reply::Opened(self.opens.unwrap_or(config)))
             }
             &Command::Close { channel } => {
                 if self.status.channels[channel.index()].open.take().is_some() && says_stopped {
@@ -327,6 +343,8 @@ impl FakeDevice {
                         self.end_session(EndReason::Suspended);
                     }
                     Fault::GoesBack => self.batch.restart(),
+                    Fault::SetBack => self.set_back = u64::from(TICK_HZ),
+                    Fault::TimeBehind => self.time_behind = u64::from(TICK_HZ),
                     _ => {}
                 }
             }

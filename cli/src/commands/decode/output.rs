@@ -44,7 +44,16 @@ impl Form {
             Some("parquet") => Self::Parquet,
             Some("csv") => Self::Csv,
             Some("json" | "jsonl" | "ndjson") => Self::Json,
-            _ => Self::Text,
+            None | Some("txt" | "log") => Self::Text,
+            // Lines of text under the name of a spreadsheet or a trace would pass for one.
+            Some(_) => {
+                let name = args.output.as_deref().unwrap_or(Path::new("-"));
+                return Err(wrong(format!(
+                    "the name '{}' does not tell the form; let it end in .txt, .csv, .json{}, or add --csv or --json",
+                    name.display(),
+                    if cfg!(feature = "parquet") { " or .parquet" } else { "" },
+                )));
+            }
         };
         if matches!(form, Self::Text | Self::Json) && (args.wide || args.resample.is_some()) {
             return Err(wrong(

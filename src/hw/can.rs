@@ -8,20 +8,20 @@
 mod bells;
 mod control;
 mod filters;
+mod registers;
 mod traffic;
 
-use core::ops::Deref;
 use core::sync::atomic::AtomicU32;
 
 use cantap_firmware::ports::Control;
 use cantap_wire::CHANNELS;
-use stm32f4xx_hal::pac::can1::RegisterBlock;
 use stm32f4xx_hal::pac::{CAN1, CAN2};
 use stm32f4xx_hal::rcc::{Enable, Rcc, Reset};
 
 pub use bells::Bells;
 pub use control::CanControl;
 pub use filters::CanFilters;
+use registers::Registers;
 pub use traffic::CanTraffic;
 
 /// Both controllers' halves, and the filters.
@@ -43,33 +43,15 @@ impl Controllers {
         CAN2::enable(rcc);
         CAN1::reset(rcc);
         CAN2::reset(rcc);
-        let blocks = [Registers(CAN1::ptr()), Registers(CAN2::ptr())];
+        let blocks = [Registers::of(CAN1::ptr()), Registers::of(CAN2::ptr())];
         let mut control = blocks.map(CanControl::new);
         // After a reset a controller sleeps.
         control.iter_mut().for_each(Control::stop);
         Self {
             traffic: [CanTraffic::new(blocks[0], &sent_at[0]), CanTraffic::new(blocks[1], &sent_at[1])],
             control,
-            filters: CanFilters::new(Registers(CAN1::ptr())),
+            filters: CanFilters::new(Registers::of(CAN1::ptr())),
             bells: (Bells::new(), Bells::new()),
         }
-    }
-}
-
-/// A controller's registers.
-#[derive(Clone, Copy)]
-struct Registers(*const RegisterBlock);
-
-// SAFETY: the registers are there for the whole program, wherever it touches them from. What the halves that hold
-// copies of the pointer write is disjoint, as their docs say.
-unsafe impl Send for Registers {}
-
-impl Deref for Registers {
-    type Target = RegisterBlock;
-
-    #[inline]
-    fn deref(&self) -> &RegisterBlock {
-        // SAFETY: the pointer is one of the PAC's, made from a peripheral that `Controllers::new` took.
-        unsafe { &*self.0 }
     }
 }

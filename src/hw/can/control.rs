@@ -3,7 +3,7 @@
 use cantap_firmware::ports::Control;
 use cantap_wire::message::{ChannelConfig, Mode};
 
-use super::Registers;
+use super::registers::Registers;
 
 /// How far [`Control::halt`] has come.
 #[derive(Clone, Copy, PartialEq, Eq)]

@@ -3,7 +3,7 @@
 use cantap_firmware::bus::filters::{BANKS, Layout, Shape};
 use cantap_firmware::ports::FilterBanks;
 
-use super::Registers;
+use super::registers::Registers;
 
 /// The acceptance filters of both controllers. They alone write FMR, FM1R, FS1R, FFA1R, FA1R and the banks.
 pub struct CanFilters {

@@ -9,8 +9,8 @@ use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{Frame, Id};
 use stm32f4xx_hal::pac::can1::rx::rir;
 
-use super::Registers;
 use super::bells::{TMEIE, switch};
+use super::registers::Registers;
 
 /// After a frame is released from the FIFO, the next is there some APB1 clocks later. So many reads, of at
 /// least two such clocks each, are far more than that; the bound only keeps a defect from hanging an interrupt.

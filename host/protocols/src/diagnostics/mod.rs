@@ -9,15 +9,17 @@ mod dtc;
 mod monitors;
 mod names;
 mod obd;
+mod parameters;
 mod reports;
 #[cfg(test)]
 mod tests;
 mod uds;
+mod values;
 
 pub use dtc::Dtc;
 pub(crate) use names::has_sub_function;
 pub use names::{data_identifier, reason, uds_service};
-pub use obd::name as parameter_name;
+pub use parameters::name as parameter_name;
 pub(crate) use uds::is_response_suppressed;
 
 use std::borrow::Cow;

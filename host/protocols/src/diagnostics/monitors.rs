@@ -1,6 +1,6 @@
 //! OBD-II's monitors: which are complete (parameters 01 and 41), and their test results (service 06).
 
-use super::obd;
+use super::values::supported;
 use crate::Field;
 
 /// How a test's values are to be read: `raw * scale + offset` (SAE J1979-DA, unit and scaling identifiers).
@@ -141,7 +141,7 @@ pub fn results(bytes: &[u8], fields: &mut Vec<Field>) {
     if mid.is_multiple_of(0x20) && bytes.len().is_multiple_of(5) {
         for part in bytes.chunks_exact(5) {
             fields.push(Field::hex("mid", part[0], 2).meaning(name(part[0])));
-            fields.push(Field::text("supported", obd::supported(part[0], &part[1..])));
+            fields.push(Field::text("supported", supported(part[0], &part[1..])));
         }
         return;
     }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::{dtc, names, obd, reports};
+use super::{dtc, names, reports, values};
 use crate::Field;
 
 /// The bit of a sub-function that suppresses the positive response.
@@ -32,7 +32,7 @@ fn value(bytes: &[u8], fields: &mut Vec<Field>) {
     if !bytes.is_empty() {
         fields.push(Field {
             name: "value".into(),
-            value: obd::text_or_bytes(bytes),
+            value: values::text_or_bytes(bytes),
             unit: "".into(),
             text: None,
         });
@@ -269,7 +269,7 @@ fn several(asked: &[u8], answer: &[u8], fields: &mut Vec<Field>) {
         let _ = write!(name, "{:02X}{:02X}", did[0], did[1]);
         fields.push(Field {
             name: name.into(),
-            value: obd::text_or_bytes(part),
+            value: values::text_or_bytes(part),
             unit: "".into(),
             text: None,
         });

@@ -1,0 +1,35 @@
+//! What several services carry in one form: numbers, sets of numbers, texts.
+
+use std::fmt::Write as _;
+
+use crate::Value;
+
+pub fn number(bytes: &[u8]) -> u64 {
+    bytes.iter().fold(0, |number, byte| number << 8 | u64::from(*byte))
+}
+
+/// The numbers whose bits are set.
+pub fn supported(first: u8, bytes: &[u8]) -> String {
+    let bits = number(bytes);
+    let mut text = String::new();
+    for bit in 0..32_u8 {
+        if bits >> (31 - bit) & 1 == 1 {
+            // Writing to a String cannot fail.
+            let _ =
+                write!(text, "{}{:02X}", if text.is_empty() { "" } else { " " }, first.wrapping_add(bit + 1));
+        }
+    }
+    text
+}
+
+/// Bytes as a text if they are one, else as they are.
+pub fn text_or_bytes(bytes: &[u8]) -> Value {
+    let end =
+        bytes.iter().rposition(|byte| *byte != 0 && *byte != b' ' && *byte != 0xFF).map_or(0, |at| at + 1);
+    let shown = &bytes[..end];
+    if shown.len() >= 3 && shown.iter().all(|byte| byte.is_ascii_graphic() || *byte == b' ') {
+        Value::Text(String::from_utf8_lossy(shown).into_owned().into())
+    } else {
+        Value::Bytes(bytes.to_vec())
+    }
+}

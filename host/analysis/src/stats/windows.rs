@@ -331,7 +331,8 @@ impl Windows {
         if rest.frames + rest.errors + rest.lost == 0 {
             return;
         }
-        if self.whole == 0 {
+        // Of a few frames alone the load would be near 100 %, whatever the bus was.
+        if self.whole == 0 && rest.length_ns >= self.length_ns / LEAST_PART {
             self.count(&rest);
         }
         closed(&rest);
@@ -353,6 +354,9 @@ impl Windows {
         self.peaks.best.iter()
     }
 }
+
+/// A trace that is shorter than a window has none, but its own length if that is at least this part of one.
+const LEAST_PART: u64 = 10;
 
 /// Silent windows that are reported one by one; a longer silence is counted.
 const MOST_SILENT_WINDOWS: i64 = 86_400;
@@ -427,6 +431,18 @@ mod tests {
         assert_eq!(loads, [3.0, 7.3]);
         assert_eq!(seen[0].frames, 0);
         assert_eq!(seen[1].frames, 1);
+    }
+
+    /// A single frame was 100 % in "windows of 1 s".
+    #[test]
+    fn a_trace_far_shorter_than_a_window_has_none() {
+        for (end, whole) in [(58_000, 0), (99_000, 0), (100_000, 1), (900_000, 1)] {
+            let mut windows = windows(1_000_000);
+            windows.advance(end, &mut |_| {});
+            windows.frame(end, classic(58), &mut |_| {});
+            windows.finish(end, &mut |_| {});
+            assert_eq!((windows.whole, windows.peaks().count() as u64), (whole, whole), "{end}");
+        }
     }
 
     #[test]

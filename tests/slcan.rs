@@ -6,8 +6,8 @@ use cantap_firmware::bus::filters::Shape;
 use cantap_firmware::bus::mailboxes::MAILBOXES;
 use cantap_firmware::bus::queue::RecordQueue;
 use cantap_firmware::bus::transmit::TX_QUEUE;
-use cantap_firmware::{TICKS_PER_MS, TICKS_PER_US};
-use cantap_wire::message::Mode;
+use cantap_firmware::{CAN_CLOCK_HZ, TICKS_PER_MS, TICKS_PER_US};
+use cantap_wire::message::{ChannelConfig, Mode};
 use cantap_wire::record::{BusErrorKind, ErrorState};
 use cantap_wire::{BitTiming, Channel, Command, Frame, Reply};
 use fakes::{Bench, SMALL_QUEUE};
@@ -391,6 +391,84 @@ fn q_keeps_the_bit_rate_for_the_next_session() {
     bench.millisecond();
     bench.port.open = true;
     converse(&mut bench, &[("O", "\x07")]);
+}
+
+/// A rate counts without having been used; one that was refused is not replaced by the one before.
+#[test]
+fn q_keeps_a_rate_that_was_only_set() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    converse(&mut bench, &[("S4", "\r"), ("Q1", "\r")]);
+    again(&mut bench);
+    converse(&mut bench, &[("L", "\r"), ("C", "\r"), ("S:", "\x07"), ("Q1", "\x07")]);
+    let timing = bench.board.control[0].started[0].timing;
+    assert_eq!(timing.bitrate_bps(cantap_firmware::CAN_CLOCK_HZ), 125_000);
+}
+
+/// Another program opens the port.
+fn again<const N: usize>(bench: &mut Bench<'_, N>) {
+    bench.port.open = false;
+    bench.millisecond();
+    bench.port.open = true;
+}
+
+/// Opens the channel as slcand does, and returns what a bus error makes the device say.
+fn reported<const N: usize>(bench: &mut Bench<'_, N>) -> String {
+    converse(bench, &[("C", "\r"), ("S6", "\r"), ("O", "\r")]);
+    let before = bench.port.from_device.len();
+    bench.board.traffic[0].error = Some(BusErrorKind::Stuff);
+    bench.millisecond();
+    let said = String::from_utf8(bench.port.from_device[before..].to_vec()).unwrap();
+    converse(bench, &[("C", "\r")]);
+    said
+}
+
+/// slcand never sends `K1`: who saved it has reports from it too, over a power cycle, and native programs leave it as it is.
+#[test]
+fn q_keeps_k_so_that_programs_that_never_send_it_have_reports() {
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    assert_eq!(reported(&mut bench), "");
+    again(&mut bench);
+    // Alone: no rate is saved with it.
+    converse(&mut bench, &[("K1", "\r"), ("Q1", "\r")]);
+    again(&mut bench);
+    converse(&mut bench, &[("O", "\x07")]);
+    assert_eq!(reported(&mut bench), "e3sss\r");
+    // A session that says otherwise is its own matter.
+    converse(&mut bench, &[("K0", "\r")]);
+    assert_eq!(reported(&mut bench), "");
+    again(&mut bench);
+    assert_eq!(reported(&mut bench), "e3sss\r");
+    // Saving a rate keeps it, here and in the native protocol.
+    converse(&mut bench, &[("Q1", "\r")]);
+    again(&mut bench);
+    bench.greet();
+    let config = ChannelConfig::listen_only(BitTiming::choose(CAN_CLOCK_HZ, 250_000, None).unwrap());
+    bench.ask(Command::Configure { channel: Channel::Can2, config }).unwrap();
+    bench.ask(Command::SaveDefaults).unwrap();
+    let saved = bench.board.chip.saved.clone();
+
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.board.chip.saved = saved.clone();
+    assert_eq!(reported(&mut bench), "e3sss\r");
+    // What firmware without it saved is the same without the last byte; it has no reports, and loses nothing else.
+    let queue = RecordQueue::<SMALL_QUEUE>::new();
+    let mut bench = Bench::new(&queue);
+    bench.board.chip.saved = saved[..saved.len() - 1].to_vec();
+    assert_eq!(reported(&mut bench), "");
+    bench.greet();
+    assert!(matches!(bench.ask(Command::Defaults { channel: CAN1 }), Ok(Reply::Defaults(_))));
+    assert!(matches!(bench.ask(Command::Defaults { channel: Channel::Can2 }), Ok(Reply::Defaults(_))));
+    bench.board.chip.saved = saved;
+    again(&mut bench);
+    converse(&mut bench, &[("K0", "\r"), ("Q1", "\r")]);
+    again(&mut bench);
+    assert_eq!(reported(&mut bench), "");
+    converse(&mut bench, &[("K1", "\r"), ("Q1", "\r"), ("Q0", "\r")]);
+    again(&mut bench);
+    assert_eq!(reported(&mut bench), "");
 }
 
 #[test]

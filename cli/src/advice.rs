@@ -17,6 +17,11 @@ const NAME_THE_FORMAT: &str = "; if it is a trace, name its format with --from";
 
 /// An error and its causes as the user reads them, but for causes that the error itself tells already.
 pub fn sentence(error: &anyhow::Error) -> String {
+    // Files are named with their errors; what has no name is standard output.
+    let is_full = |error: &io::Error| error.kind() == io::ErrorKind::StorageFull;
+    if error.chain().count() == 1 && error.downcast_ref().is_some_and(is_full) {
+        return format!("not all of the output could be written: {error}; make room or choose another place");
+    }
     error.chain().fold(String::new(), |text, cause| {
         let told = told(cause);
         match text.as_str() {

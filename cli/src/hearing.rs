@@ -17,6 +17,7 @@ pub struct Hearing {
 
 #[derive(Clone, Debug, Default)]
 struct Heard {
+    /// Those that were lost are frames, too.
     has_frames: bool,
     first_error: Option<Instant>,
     is_told: bool,
@@ -32,7 +33,7 @@ impl Hearing {
             }
             let heard = &mut self.channels[index];
             match record.event {
-                TraceEvent::Frame { .. } => heard.has_frames = true,
+                TraceEvent::Frame { .. } | TraceEvent::Lost { .. } => heard.has_frames = true,
                 TraceEvent::BusError { .. } | TraceEvent::ErrorsSuppressed { .. } => {
                     heard.first_error.get_or_insert(now);
                 }
@@ -58,6 +59,17 @@ impl Hearing {
             .zip(&self.channels)
             .filter(move |(_, heard)| heard.has_errors_only_since(now))
             .map(|(number, _)| number)
+    }
+
+    /// The channels, from 1, that have heard errors and no frame at the end of everything, however short that was.
+    pub fn deaf(&self) -> impl Iterator<Item = u8> {
+        let is_deaf = |heard: &Heard| !heard.has_frames && heard.first_error.is_some();
+        (1..).zip(&self.channels).filter_map(move |(number, heard)| is_deaf(heard).then_some(number))
+    }
+
+    /// Whether any channel has heard a frame.
+    pub fn has_frames(&self) -> bool {
+        self.channels.iter().any(|heard| heard.has_frames)
     }
 
     /// Whether that was reported of a channel.

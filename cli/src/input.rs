@@ -136,6 +136,14 @@ impl Records {
         }
     }
 
+    /// At the end: an error if this was a device that heard errors and no frame, as at a wrong bit rate.
+    pub fn judge(&self) -> anyhow::Result<()> {
+        match &self.source {
+            Source::File(..) => Ok(()),
+            Source::Device(live) => live.judge(),
+        }
+    }
+
     /// Puts the next records that pass the filters in the place of what is in `records`, which may be none; false at the
     /// end. With `--strict`, an issue is an error.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> anyhow::Result<bool> {

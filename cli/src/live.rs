@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use anyhow::anyhow;
+use anyhow::{anyhow, bail};
 use cantap::TraceRecord;
 use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
 use cantap::wire::message::{ChannelConfig, Mode};
@@ -189,13 +189,26 @@ impl LiveRecords {
         &self.addresses
     }
 
-    /// Whether it has been said of a channel that it hears errors only.
-    pub fn has_told_errors(&self, number: u8) -> bool {
-        self.hearing.is_told(number)
+    /// At the end: says what it means that channels heard errors and no frame, where that was not said on the way; an error if nothing
+    /// else was heard at all, since that must not look like success. With a filter in the device, there may still be frames.
+    pub fn judge(&self) -> anyhow::Result<()> {
+        if self.is_filtered {
+            return Ok(());
+        }
+        let mut deaf = self.hearing.deaf();
+        if !self.hearing.has_frames()
+            && let Some(first) = deaf.next()
+        {
+            bail!(self.errors_only(first));
+        }
+        for number in deaf.filter(|number| !self.hearing.is_told(*number)) {
+            stderr::warn(&self.errors_only(number));
+        }
+        Ok(())
     }
 
     /// What it means that a channel hears errors only, and what to do.
-    pub fn errors_only(&self, number: u8) -> String {
+    fn errors_only(&self, number: u8) -> String {
         let (board, channel) = place_of(number);
         let device = self.addresses.get(board).map(ToString::to_string).unwrap_or_default();
         hearing::meaning(number, &device, channel.number())

@@ -125,3 +125,47 @@ fn a_capture_that_hears_only_errors_says_so_at_once_and_fails() {
     assert_eq!(code, Some(0), "{err}");
     assert_eq!(err.matches("channel 2: only errors").count(), 1, "{err}");
 }
+
+/// Too short a time for the warning on the way: the end says it all the same.
+#[test]
+fn whatever_listens_and_hears_only_errors_fails_and_says_why() {
+    for command in [
+        "stats",
+        "stats --json",
+        "decode --db ../host/virtual/src/car/car.dbc",
+        "search --id 123",
+        "conversations",
+        "capture",
+    ] {
+        let (code, _, err) = line(&format!("{command} -d virtual:bitrate=500k,load=50 -b 250k -t 400ms"));
+        assert_eq!(code, Some(1), "{command}: {err}");
+        let told = err.matches("channel 1: only errors and no frame").count();
+        assert!(told == 1 && err.contains("cantap autobaud -d virtual"), "{command}: {err}");
+    }
+    // One good channel is enough, and silence is nothing wrong.
+    for bus in ["virtual:bitrate=500k,load=50 -b 500k -b 2:250k", "virtual:load=0 -b 500k"] {
+        let (code, _, err) = line(&format!("stats -d {bus} -t 400ms"));
+        assert!(code == Some(0) && !err.contains("channel 1: only errors"), "{bus}: {err}");
+    }
+}
+
+/// The window in which listening ends is milliseconds long, and has errors of a tenth of a second before it.
+#[test]
+fn live_statistics_have_a_line_for_each_whole_window() {
+    for (options, steady) in
+        [("virtual:load=50 -b 500k", true), ("virtual:bitrate=500k,load=50 -b 250k", false)]
+    {
+        let (_, _, err) = line(&format!("stats -d {options} --window 500ms -t 1100ms"));
+        let loads: Vec<f64> = err
+            .lines()
+            .filter(|line| line.contains(" frames/s "))
+            .map(|line| line.split(" % |").next().unwrap().rsplit(' ').next().unwrap().parse().unwrap())
+            .collect();
+        assert_eq!(loads.len(), 4, "{err}");
+        let is_likely = |load: &f64| if steady { (45.0..55.0).contains(load) } else { *load < 90.0 };
+        assert!(loads.iter().all(is_likely), "{err}");
+        // Shorter than a window: that is all there is.
+        let (_, _, err) = line(&format!("stats -d {options} --window 5s -t 400ms"));
+        assert_eq!(err.lines().filter(|line| line.contains(" frames/s ")).count(), 2, "{err}");
+    }
+}

@@ -153,10 +153,42 @@ fn content_decides_where_it_is_clear_and_from_overrides() {
         let (code, out, err) = cantap(&directory, &["convert", wrong, "-", "--from", "dif"]);
         assert_eq!((code, out.as_str()), (Some(1), ""), "{wrong}: {err}");
     }
+    // The logs of other programs, too, but where they are commonly named so.
+    let printed = "Timestamp: 1410714882.000000    ID:      123    S Rx                DL:  2    11 22     Channel: can0\n";
+    let shown = " (1410714882.000000)  can0  123   [2]  11 22\n";
+    for (name, text, format) in [
+        ("printed.txt", printed, None),
+        ("printed.asc", printed, Some("printer")),
+        ("shown.log", shown, None),
+        ("shown.blf", shown, Some("candump-screen")),
+    ] {
+        fs::write(directory.join(name), text).unwrap();
+        let (code, out, err) = cantap(&directory, &["convert", name, "-"]);
+        assert_eq!((code, out.as_str()), (Some(0), "(1410714882.000000) can0 123#1122\n"), "{name}: {err}");
+        let note = format.map(|format| format!("{name} is read as {format}, which its content is"));
+        assert!(note.map_or(err.is_empty(), |note| err.contains(&note)), "{name}: {err}");
+    }
     fs::copy(directory.join("a.log"), directory.join("name.xyz")).unwrap();
     fs::write(directory.join("rubbish.xyz"), "rubbish\n").unwrap();
     let (code, _, err) = cantap(&directory, &["stats", "rubbish.xyz"]);
     assert!(code == Some(1) && err.contains("name it with one of --from "), "{err}");
+}
+
+/// Well-formed captures and measurements that have nothing of CAN in them.
+#[test]
+fn a_file_without_traffic_of_can_is_no_success_and_says_what_is_in_it() {
+    let directory = directory("without_can");
+    let word = |value: u32| value.to_le_bytes();
+    let head = [0xA1B2_C3D4, 0x0004_0002, 0, 0, 65535, 1].map(word).concat();
+    let packet = [[1_700_000_000, 0, 60, 60].map(word).concat(), vec![0; 60]].concat();
+    fs::write(directory.join("ethernet.pcap"), [head, packet.clone(), packet].concat()).unwrap();
+    for command in [&["stats", "ethernet.pcap"][..], &["convert", "ethernet.pcap", "out.log"]] {
+        let (code, _, err) = cantap(&directory, command);
+        assert_eq!(code, Some(1), "{err}");
+        let says = "it looks like pcap without traffic of CAN: packets that are not SocketCAN (2)";
+        assert!(err.contains(says), "{err}");
+    }
+    assert!(!directory.join("out.log").exists());
 }
 
 #[test]

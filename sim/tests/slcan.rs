@@ -3,7 +3,7 @@
 
 mod common;
 
-use cantap_emu::bus::{BitTime, Node};
+use cantap_emu::bus::{BitTime, Disturbance, Node};
 use cantap_emu::soc::CAN_IRQS;
 use cantap_emu::traffic::{Kind, Script, Traffic};
 use cantap_emu::usb_host::Timing;
@@ -157,6 +157,27 @@ fn every_letter_is_answered_on_an_open_channel_and_what_would_change_it_is_refus
     for line in ["Q1\r", "Q0\r"] {
         let said = say(&mut rig, line) + &text(rig.run_unbooked(3_000 * MS).unwrap());
         assert_eq!(said, "\r", "the answer to {line:?}");
+    }
+}
+
+/// Through the flash: who saved `K1` has reports from programs that never send it.
+#[test]
+#[cfg_attr(not(cantap_elf), ignore = "no ELF in CANTAP_FIRMWARE_ELF")]
+fn reports_that_were_saved_are_there_without_being_asked_for() {
+    let mut rig = plugged_in();
+    for (lines, reports) in [("C\rK1\rQ1\r", true), ("K0\rQ1\r", false), ("K1\rQ1\rQ0\r", false)] {
+        let said = say(&mut rig, lines) + &text(rig.run_unbooked(300 * MS).unwrap());
+        assert!(!said.contains('\x07'), "{lines:?}: {said:?}");
+        // A program that comes later.
+        rig.with_host(|host, _| host.close_port());
+        rig.run_unbooked(20 * MS).unwrap();
+        rig.wait_for_port().unwrap();
+        converse(&mut rig, &[("C\rS6\rO\r", "\r\r\r")]);
+        rig.machine.board().wires[0].disturb(0, Disturbance::Crc);
+        on_the_bus(&mut rig, &["123#00"]);
+        let said = text(rig.run_unbooked(20 * MS).unwrap());
+        assert_eq!(said.contains("e3"), reports, "{lines:?}: {said:?}");
+        converse(&mut rig, &[("C\r", "\r")]);
     }
 }
 

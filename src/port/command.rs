@@ -21,7 +21,7 @@ use measuring::Measuring;
 pub use sending::send;
 use sending::{set_periodic, set_trigger};
 pub use settings::MAX_SAVED;
-use settings::{ChannelSettings, saved, store};
+use settings::{ChannelSettings, add_reports, saved, saved_reports, store};
 
 /// A controller leaves the bus when the frame on it has ended: 160 bits at 5 kbit/s are 32 ms. After this long the
 /// bus is stuck, and the controller is made to leave.
@@ -161,7 +161,7 @@ impl Commands {
             }
             Command::Reset => return Ok(self.begin(Work::Restart, board)),
             Command::Bootloader => return Ok(self.begin(Work::Bootloader, board)),
-            Command::SaveDefaults => self.save(board)?,
+            Command::SaveDefaults => self.save(None, board)?,
             Command::ClearDefaults => store(&[], board)?,
             Command::Configure { channel, config } => self.configure(channel, config, board)?,
             Command::Defaults { channel } => {
@@ -358,13 +358,18 @@ impl Commands {
         }
     }
 
+    /// A channel's configuration in this session.
+    pub fn config(&self, channel: Channel) -> Option<ChannelConfig> {
+        self.settings[channel.index()].config
+    }
+
     /// A channel's configuration in this session, or the one that was saved.
     pub fn config_or_saved<'q, const N: usize>(
         &self,
         channel: Channel,
         board: &mut impl Board<'q, N>,
     ) -> Option<ChannelConfig> {
-        self.settings[channel.index()].config.or_else(|| saved(channel, board).map(|saved| saved.config))
+        self.config(channel).or_else(|| saved(channel, board).map(|saved| saved.config))
     }
 
     #[inline(never)]
@@ -469,12 +474,23 @@ impl Commands {
         }
     }
 
-    /// Stores each configured channel's settings beside what is stored for the other.
+    /// Whether slcan's reports are wanted by what was saved.
+    pub fn saved_reports<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> bool {
+        saved_reports(board)
+    }
+
+    /// Stores each configured channel's settings beside what is stored for the other, and whether slcan's reports are wanted, if
+    /// that was said.
     #[inline(never)]
-    fn save<'q, const N: usize>(&self, board: &mut impl Board<'q, N>) -> Result<Reply, Refusal> {
-        if self.settings.iter().all(|settings| settings.config.is_none()) {
+    pub fn save<'q, const N: usize>(
+        &self,
+        reports: Option<bool>,
+        board: &mut impl Board<'q, N>,
+    ) -> Result<Reply, Refusal> {
+        if reports.is_none() && self.settings.iter().all(|settings| settings.config.is_none()) {
             return Err(Refusal::NothingSaved);
         }
+        let reports = reports.unwrap_or_else(|| saved_reports(board));
         let mut bytes = [0; MAX_SAVED];
         let mut len = 0;
         for (channel, settings) in Channel::ALL.into_iter().zip(&self.settings) {
@@ -488,6 +504,7 @@ impl Commands {
             // Cannot fail: so much is the most that there can be.
             len += written.map_err(|_| Refusal::Hardware)?.len();
         }
+        let len = add_reports(reports, len, &mut bytes);
         store(&bytes[..len], board)
     }
 }

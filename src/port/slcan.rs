@@ -105,7 +105,9 @@ pub struct Slcan {
     code: u32,
     mask: u32,
     flags: u8,
-    /// Losses, errors and states are lines (`K1`).
+    /// What `K` said, if it was sent: whether losses, errors and states are lines.
+    asked_reports: Option<bool>,
+    /// They are, since the channel was opened: without a `K`, as it was saved.
     reports: bool,
     /// A frame was refused because there was no room, which is still to be reported.
     refused_frame: bool,
@@ -133,6 +135,7 @@ impl Slcan {
             code: 0,
             mask: u32::MAX,
             flags: 0,
+            asked_reports: None,
             reports: false,
             refused_frame: false,
             tag: 0,
@@ -246,7 +249,7 @@ impl Slcan {
                 Some(ok)
             }
             (b'K', &[digit @ b'0'..=b'1']) if !open => {
-                self.reports = digit == b'1';
+                self.asked_reports = Some(digit == b'1');
                 Some(ok)
             }
             (b'P', []) if open && !self.auto_poll => {
@@ -291,7 +294,7 @@ impl Slcan {
                 self.set_filters(commands, board).then_some(ok)
             }
             (b'Q', [b'0']) if !open => run(Command::ClearDefaults, commands, board),
-            (b'Q', [b'1' | b'2']) if !open => run(Command::SaveDefaults, commands, board),
+            (b'Q', [b'1' | b'2']) if !open => self.save(commands, board),
             (b'I' | b'Y', []) => {
                 let registers = board.with_capture(|capture, traffic, _| {
                     capture.registers(CHANNEL, &traffic[CHANNEL.index()])
@@ -317,7 +320,23 @@ impl Slcan {
         let config = ChannelConfig { mode, ..ChannelConfig::listen_only(timing) };
         self.flags = 0;
         self.polled = 0;
+        self.reports = self.asked_reports.unwrap_or_else(|| commands.saved_reports(board));
         run(Command::Open { channel: CHANNEL, config: Some(config) }, commands, board)
+    }
+
+    /// Saves the bit rate that is set, and what `K` said, if one of them was sent.
+    fn save<'q, const N: usize>(
+        &self,
+        commands: &mut Commands,
+        board: &mut impl Board<'q, N>,
+    ) -> Option<Done> {
+        if let Rate::Set(timing) = self.rate {
+            let before = commands.config(CHANNEL).unwrap_or_else(|| ChannelConfig::listen_only(timing));
+            let config = ChannelConfig { timing, ..before };
+            commands.execute(Command::Configure { channel: CHANNEL, config }, board).ok()?;
+        }
+        let saved = self.rate != Rate::Refused && commands.save(self.asked_reports, board).is_ok();
+        saved.then_some(Done::Answer(Answer::Ok))
     }
 
     fn transmit<'q, const N: usize>(

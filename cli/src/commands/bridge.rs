@@ -187,11 +187,14 @@ fn begun(lane: &Lane, device: Option<&OpenDevice>) -> String {
 
 /// And at its end.
 fn ended(lane: &Lane) -> String {
-    let [heard, sent, not_sent, undelivered] =
-        [&lane.counts.heard, &lane.counts.sent, &lane.counts.not_sent, &lane.counts.undelivered]
+    let counts = &lane.counts;
+    let [heard, lost, undelivered, sent, not_sent] =
+        [&counts.heard, &counts.lost, &counts.undelivered, &counts.sent, &counts.not_sent]
             .map(|count| count.load(Ordering::Relaxed));
+    let at_least = if counts.lost_more.load(Ordering::Relaxed) { "at least " } else { "" };
     format!(
-        "{}: {heard} frames heard, {undelivered} not taken by the interface; {sent} sent, {not_sent} not sent",
+        "{}: {heard} frames heard, {at_least}{lost} lost before that, {undelivered} not taken by the interface; {sent} sent, \
+         {not_sent} not sent",
         lane.name
     )
 }

@@ -7,7 +7,6 @@ use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
-use anyhow::bail;
 use cantap::{TraceEvent, TraceRecord};
 use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
 use cantap_signals::trigger::Trigger;
@@ -16,6 +15,7 @@ use cantap_trace::filter::Filter;
 use self::sink::Sink;
 use self::summary::{ChannelSummary, Summary, TriggerSummary};
 use super::convert::WriteArgs;
+use crate::args;
 use crate::boards::Boards;
 use crate::channel_args::ChannelArgs;
 use crate::completion;
@@ -25,7 +25,6 @@ use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
-use crate::{args, stderr};
 use cantap_address::Address;
 
 /// The command line.
@@ -113,8 +112,9 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let trigger = args.trigger.trigger(boards.addresses())?;
     let mut live = LiveRecords::open(&boards, &args.open, &args.filter, args.time)?;
     live.give_up_after(args.give_up_after.or(args.frames.map(|_| GIVE_UP_AFTER)));
-    let mut sink = create_sink(args, trigger, live.channels())?;
+    // The time that was asked for runs from here.
     let started = Instant::now();
+    let mut sink = create_sink(args, trigger, live.channels())?;
     let mut channels: Vec<_> = boards.channel_numbers().map(|number| (number, Meter::new(0))).collect();
     for (number, config, can_clock_hz) in live.opened() {
         if let Some((_, meter)) = channels.iter_mut().find(|(channel, _)| *channel == number) {
@@ -137,7 +137,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     summary.tell(args.json, args.output.as_deref())?;
     end?;
     finished?;
-    judge_errors(args, &live, &summary)?;
+    live.judge()?;
     Ok(ExitCode::SUCCESS)
 }
 
@@ -284,24 +284,6 @@ impl View {
 fn is_enough(args: &Args, sink: &Sink, meters: &Meters) -> bool {
     args.frames.is_some_and(|frames| meters.frames() >= frames)
         || sink.trigger.as_ref().is_some_and(|trigger| args.trigger.is_over(trigger))
-}
-
-/// Says what it means that channels heard errors and no frame, where that was not said on the way; an error if nothing else was
-/// heard at all. With a filter, there may still be frames.
-fn judge_errors(args: &Args, live: &LiveRecords, summary: &Summary) -> anyhow::Result<()> {
-    if !args.filter.is_empty() {
-        return Ok(());
-    }
-    let mut deaf = summary.channels.iter().filter(|channel| channel.frames == 0 && channel.bus_errors > 0);
-    if summary.channels.iter().all(|channel| channel.frames == 0)
-        && let Some(first) = deaf.next()
-    {
-        bail!(live.errors_only(first.channel));
-    }
-    for channel in deaf.filter(|channel| !live.has_told_errors(channel.channel)) {
-        stderr::warn(&live.errors_only(channel.channel));
-    }
-    Ok(())
 }
 
 /// The format where the file's suffix does not say one.

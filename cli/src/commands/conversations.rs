@@ -96,6 +96,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if !args.quiet {
         summary.tell();
     }
+    records.judge()?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -67,6 +67,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if lost > 0 {
         eprintln!("cantap: {lost} frames or more are missing in the trace");
     }
+    records.judge()?;
     Ok(ExitCode::SUCCESS)
 }
 

@@ -120,7 +120,11 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if args.count {
         writeln!(std::io::stdout(), "{found}")?;
     }
-    Ok(if found > 0 { ExitCode::SUCCESS } else { ExitCode::from(exit::FAILURE) })
+    if found > 0 {
+        return Ok(ExitCode::SUCCESS);
+    }
+    records.judge()?;
+    Ok(ExitCode::from(exit::FAILURE))
 }
 
 /// Goes through the trace and hands on what was found with its context; returns how many were.

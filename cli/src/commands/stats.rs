@@ -112,6 +112,8 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let mut missing = Missing::default();
     if let Some(mut live) = live {
         ended = live::run(!args.json, &mut live, &mut statistics, &mut windows, &mut known);
+        // What was heard is shown, and is no success if it was errors only.
+        ended = ended.and_then(|()| live.judge());
     } else if let Some(path) = &args.input {
         let mut records = args.read.open(path)?;
         let mut closed = |window: &_| {

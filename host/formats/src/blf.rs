@@ -174,6 +174,24 @@ mod tests {
         assert!(most > 19_900, "{most}");
     }
 
+    /// Found by random damage: all times were moved to 1970 without a word.
+    #[test]
+    fn a_start_that_is_no_date_is_named_and_none_at_all_is_not() {
+        let whole = file(&[data_record(1_410_714_882_000_000_000)]);
+        let at = super::START_OFFSET;
+        for (place, value) in [(at + 2, 13), (at + 3, 1), (at + 8, 24)] {
+            let mut damaged = whole.clone();
+            damaged[place] = value;
+            let (read, issues) = tests::read(Format::Blf, &damaged);
+            assert_eq!((read.len(), issues.len()), (1, 1), "{issues:?}");
+            assert!(issues[0].contains("expected a date that the times count from"), "{issues:?}");
+        }
+        let mut without = whole.clone();
+        without[at..at + 16].fill(0);
+        let (read, issues) = tests::read(Format::Blf, &without);
+        assert_eq!((read[0].time_ns, issues), (0, Vec::new()));
+    }
+
     #[test]
     fn damage_costs_a_container_and_is_named() {
         let records: Vec<_> = (0..20_000).map(|at| data_record(at * 1_000_003)).collect();

@@ -54,10 +54,18 @@ impl Encoder {
                 Self::Gzip(flate2::write::GzEncoder::new(out, flate2::Compression::new(GZIP_LEVEL)))
             }
             #[cfg(feature = "zstd")]
-            Compression::Zstd => Self::Zstd(zstd::stream::write::Encoder::new(out, ZSTD_LEVEL)?),
+            Compression::Zstd => {
+                let mut encoder = zstd::stream::write::Encoder::new(out, ZSTD_LEVEL)?;
+                // Neither this nor LZ4 has a checksum by itself, and damage would give other frames.
+                encoder.include_checksum(true)?;
+                Self::Zstd(encoder)
+            }
             #[cfg(not(feature = "zstd"))]
             Compression::Zstd => return Err(without_zstd()),
-            Compression::Lz4 => Self::Lz4(lz4_flex::frame::FrameEncoder::new(out)),
+            Compression::Lz4 => {
+                let info = lz4_flex::frame::FrameInfo::new().block_checksums(true).content_checksum(true);
+                Self::Lz4(lz4_flex::frame::FrameEncoder::with_frame_info(info, out))
+            }
             Compression::Xz => {
                 let options = lzma_rust2::XzOptions::with_preset(XZ_PRESET);
                 Self::Xz(lzma_rust2::XzWriter::new(out, options)?)
@@ -181,6 +189,36 @@ mod tests {
             )
         };
         (0..40_000).map(line).collect::<String>().into_bytes()
+    }
+
+    /// Found by random damage: files in zstd and LZ4 gave other frames without a word.
+    #[test]
+    fn damage_to_a_compressed_file_is_noticed() {
+        let directory = tempfile::tempdir().unwrap();
+        let text = &text()[..50_000];
+        for compression in [
+            Compression::Gzip,
+            #[cfg(feature = "zstd")]
+            Compression::Zstd,
+            Compression::Lz4,
+            Compression::Xz,
+        ] {
+            let path = directory.path().join("a");
+            let mut compressed = Compressed::new(File::create(&path).unwrap(), compression).unwrap();
+            compressed.write(text).unwrap();
+            compressed.finish().unwrap();
+            let whole = std::fs::read(&path).unwrap();
+            let mut random = fastrand::Rng::with_seed(12);
+            for _ in 0..500 {
+                let mut damaged = whole.clone();
+                let at = random.usize(..whole.len());
+                damaged[at] ^= random.u8(1..);
+                let mut read = Vec::new();
+                let unpacked = compression.unpack(io::Cursor::new(damaged));
+                let result = unpacked.and_then(|mut source| source.read_to_end(&mut read));
+                assert!(result.is_err() || read == text, "{compression:?}: {at} of {}", whole.len());
+            }
+        }
     }
 
     #[test]

@@ -77,14 +77,14 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
     (Format::Pcap, &["pcap"], &["pcap", "cap"]),
     (Format::Dif, &["dif"], &["dif"]),
     (Format::Mf4, &["mf4"], &["mf4", "mdf"]),
-    (Format::CandumpScreen, &["candump-screen"], &[]),
-    (Format::Busmaster, &["busmaster"], &[]),
+    (Format::CandumpScreen, &["candump-screen"], &["txt", "log"]),
+    (Format::Busmaster, &["busmaster"], &["log"]),
     (Format::Crtd, &["crtd"], &["crtd", "crt"]),
-    (Format::Kvaser, &["kvaser"], &[]),
+    (Format::Kvaser, &["kvaser"], &["txt", "log"]),
     (Format::Microchip, &["microchip"], &["can"]),
-    (Format::CanHacker, &["canhacker"], &[]),
-    (Format::Printer, &["printer"], &[]),
-    (Format::CanKing, &["canking"], &[]),
+    (Format::CanHacker, &["canhacker"], &["trc"]),
+    (Format::Printer, &["printer"], &["txt", "log"]),
+    (Format::CanKing, &["canking"], &["txt", "log"]),
     (Format::Sqlite, &["sqlite"], &["db", "sqlite", "sqlite3"]),
 ];
 
@@ -150,12 +150,18 @@ impl Format {
 
     /// By a path's suffix; `.gz`, `.zst`, `.xz` and `.lz4` are looked through.
     pub fn of_path(path: &Path) -> Result<Self, UnknownFormat> {
+        Self::all()
+            .find(|format| format.has_suffix_of(path))
+            .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
+    }
+
+    /// Whether a file of the format may be named so.
+    pub(crate) fn has_suffix_of(self, path: &Path) -> bool {
         let name = path.file_name().unwrap_or_default().to_string_lossy().to_ascii_lowercase();
         let (bare, _) = Compression::split(&name);
-        bare.rsplit_once('.')
-            .and_then(|(_, suffix)| FORMATS.iter().find(|(_, _, suffixes)| suffixes.contains(&suffix)))
-            .map(|(format, ..)| *format)
-            .ok_or_else(|| UnknownFormat::Suffix(path.display().to_string()))
+        let suffixes =
+            FORMATS.iter().find(|(format, ..)| *format == self).map_or(&[][..], |(_, _, suffixes)| suffixes);
+        bare.rsplit_once('.').is_some_and(|(_, suffix)| suffixes.contains(&suffix))
     }
 
     /// Whether both are read by the same reader: the content says which version or dialect it is.

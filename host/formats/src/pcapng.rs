@@ -17,8 +17,13 @@ pub(crate) const SECTION_HEADER: u32 = 0x0A0D_0D0A;
 const INTERFACE_DESCRIPTION: u32 = 1;
 const OBSOLETE_PACKET: u32 = 2;
 const SIMPLE_PACKET: u32 = 3;
+const NAME_RESOLUTION: u32 = 4;
 const STATISTICS: u32 = 5;
 const ENHANCED_PACKET: u32 = 6;
+const SECRETS: u32 = 0xA;
+/// What programs add for themselves; the second kind is not to be copied to another file.
+const CUSTOM: u32 = 0xBAD;
+const CUSTOM_NOT_COPIED: u32 = 0x4000_0BAD;
 
 /// How a section header shows its byte order.
 const BYTE_ORDER_MAGIC: u32 = 0x1A2B_3C4D;
@@ -56,7 +61,7 @@ mod tests {
 
     use super::super::tests;
     use super::{ISB_IFDROP, ISB_IFRECV, ISB_USRDELIV, STATISTICS};
-    use crate::{ChannelInfo, Format, WriteOptions, create_stream_writer};
+    use crate::{ChannelInfo, Format, ReadOptions, TraceReader, WriteOptions, create_stream_writer};
     use cantap_trace::testing::{data_record, record_or_fd};
     use cantap_trace::{Direction, TraceEvent, TraceRecord};
     use cantap_wire::record::LossStage;
@@ -85,6 +90,23 @@ mod tests {
         damaged[block + 4..block + 8].copy_from_slice(&[0xFF; 4]);
         let (read, issues) = tests::read(Format::Pcapng, &damaged);
         assert_eq!((read.len(), issues.len()), (99, 1), "{issues:?}");
+    }
+
+    /// Found by random damage: the block was passed over as one that is none of ours.
+    #[test]
+    fn a_packet_whose_kind_is_damaged_is_counted() {
+        let records: Vec<_> = (0..10).map(data_record).collect();
+        let options = WriteOptions { format: Some(Format::Pcapng), ..WriteOptions::default() };
+        let (mut file, _) = tests::write_with(&options, &records);
+        let block = file.len() - 64 - 5 * 48;
+        assert_eq!(file[block..block + 4], [6, 0, 0, 0]);
+        file[block + 2] = 0x9D;
+        let source = std::io::Cursor::new(file);
+        let mut reader =
+            TraceReader::from_source("damaged", source, Format::Pcapng, &ReadOptions::default()).unwrap();
+        assert_eq!(reader.by_ref().flatten().count(), 9);
+        let left_out: Vec<_> = reader.left_out().iter().collect();
+        assert_eq!(left_out, [("blocks of kinds that are not known", 1)]);
     }
 
     /// A section in the other byte order with microseconds, as a router might write it.

@@ -101,10 +101,9 @@ pub fn open_reader(path: impl AsRef<Path>, options: &ReadOptions) -> Result<Trac
         // A pipe may give no more than a line for a long time.
         let head = if input.has_line() { input.buffered() } else { input.peek(64).map_err(failed)? };
         match (Format::of_path(path), Format::of_content(head)) {
-            // The logs of other programs share their suffixes with formats of ours.
-            (_, Some(content)) if !content.is_written() => content,
             (Ok(format), Some(content)) if !content.is_kind_of(format) => {
-                named = Some(format);
+                // The logs of other programs share their suffixes with formats of ours.
+                named = (!content.has_suffix_of(path)).then_some(format);
                 content
             }
             (Ok(format), _) | (Err(_), Some(format)) => format,
@@ -198,7 +197,13 @@ impl TraceReader {
         (self.records == 0 && something).then(|| NothingRead {
             file: self.name.clone(),
             format: self.format,
-            looks_like: content::looks_like(&self.head, self.format),
+            looks_like: if self.issues == 0 {
+                let kinds: Vec<_> =
+                    self.left_out.iter().map(|(what, count)| format!("{what} ({count})")).collect();
+                format!("{} without traffic of CAN: {}", self.format, kinds.join(", "))
+            } else {
+                content::looks_like(&self.head, self.format)
+            },
         })
     }
 

@@ -15,6 +15,7 @@ mod protocol;
 mod redir;
 mod script;
 mod server;
+mod urb;
 mod urbs;
 
 pub use error::Error;

@@ -4,7 +4,7 @@
 use std::io::{self, Read};
 
 use super::exported::Exported;
-use super::urbs::{Completion, Urb};
+use super::urb::{Completion, Urb};
 
 const VERSION: u32 = 0x0111;
 const LIST: u16 = 0x8005;

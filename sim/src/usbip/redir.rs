@@ -5,7 +5,8 @@ use std::collections::HashMap;
 use std::io::{self, Read};
 
 use super::exported::Exported;
-use super::urbs::{Completion, EOVERFLOW, EPIPE, Urb};
+use super::urb::{Completion, Urb};
+use super::urbs::{EOVERFLOW, EPIPE};
 
 const HELLO: u32 = 0;
 const DEVICE_CONNECT: u32 = 1;

@@ -14,7 +14,8 @@ use super::exported::{BUS_ID, Exported};
 use super::protocol::{self, Message, Opening};
 use super::redir::{Action, Packet, Redir};
 use super::script::{self, Wish};
-use super::urbs::{Urb, Urbs};
+use super::urb::Urb;
+use super::urbs::Urbs;
 use crate::{CYCLES_PER_SECOND, CYCLES_PER_US};
 use cantap_emu::elf::Image;
 

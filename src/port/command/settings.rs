@@ -8,8 +8,13 @@ use serde::{Deserialize, Serialize};
 use crate::port::board::Board;
 use crate::ports::Chip;
 
-/// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each.
-pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12);
+/// Most bytes that [`Chip::save`] must hold: for each channel a configuration of 12 bytes and its filters, 12 bytes each; and
+/// slcan's byte.
+pub const MAX_SAVED: usize = CHANNELS * (16 + MAX_FILTERS * 12) + 1;
+
+/// slcan's byte stands behind the channels' settings, where it is wanted: firmware that knows nothing of it leaves it unread, and
+/// without it nothing is reported. Bit 0: `K1`.
+const REPORTS: u8 = 1 << 0;
 
 /// One channel's settings, applied or saved.
 #[derive(Clone, Debug, Default, Serialize, Deserialize)]
@@ -34,6 +39,30 @@ pub(super) fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board
         rest = behind;
     }
     None
+}
+
+/// Whether slcan's reports were saved as wanted (`K1`).
+#[inline(never)]
+pub(super) fn saved_reports<'q, const N: usize>(board: &mut impl Board<'q, N>) -> bool {
+    let mut bytes = [0; MAX_SAVED];
+    let len = board.chip().load(&mut bytes);
+    let mut rest = bytes.get(..len).unwrap_or_default();
+    for _ in Channel::ALL {
+        let Ok((_, behind)) = postcard::take_from_bytes::<ChannelSettings>(rest) else { return false };
+        rest = behind;
+    }
+    rest.first().is_some_and(|flags| flags & REPORTS != 0)
+}
+
+/// Adds slcan's byte behind `len` bytes of the channels' settings. Returns the length with it.
+pub(super) fn add_reports(reports: bool, len: usize, bytes: &mut [u8; MAX_SAVED]) -> usize {
+    match bytes.get_mut(len).filter(|_| reports) {
+        Some(at) => {
+            *at = REPORTS;
+            len + 1
+        }
+        None => len,
+    }
 }
 
 /// Writing flash stops the processor for up to two seconds, so no channel may be open.

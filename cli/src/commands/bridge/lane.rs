@@ -10,7 +10,7 @@ use cantap::wire::record::{LossStage, TransmitFailure};
 use cantap::wire::{Channel, Frame};
 use cantap::{Direction, TraceEvent, TraceRecord};
 
-use super::frames::{RawFrame, raw_error, raw_frame};
+use super::frames::{RawFrame, frame_of, raw_error, raw_frame};
 use super::interface::{Known, Port};
 use crate::stderr;
 
@@ -40,6 +40,9 @@ pub struct Counts {
     pub not_sent: AtomicU64,
     /// Frames that the interface did not take.
     pub undelivered: AtomicU64,
+    /// Frames that were lost before they came here, and whether it may have been more.
+    pub lost: AtomicU64,
+    pub lost_more: AtomicBool,
 }
 
 fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
@@ -91,7 +94,6 @@ impl Lane {
     pub fn hear(&self, records: &[TraceRecord]) -> io::Result<()> {
         let number = channel_number(0, self.channel);
         let mut raw = Vec::new();
-        let mut frames = 0;
         for record in records.iter().filter(|record| record.channel == number) {
             match &record.event {
                 TraceEvent::Frame { frame, direction, .. } => {
@@ -100,11 +102,12 @@ impl Lane {
                     if *direction == Direction::Tx && self.has_ended(frame) && !self.known.echoes {
                         continue;
                     }
-                    frames += 1;
                     raw.push(raw_frame(frame));
                 }
                 event => {
-                    if matches!(event, TraceEvent::Lost { .. }) {
+                    if let TraceEvent::Lost { count, at_least, .. } = event {
+                        add(&self.counts.lost, *count as usize);
+                        self.counts.lost_more.fetch_or(*at_least, Ordering::Relaxed);
                         // A confirmation may be among what is lost, and what it was for is not waited for for ever.
                         lock(&self.own).clear();
                     }
@@ -112,18 +115,14 @@ impl Lane {
                 }
             }
         }
-        let delivered = self.deliver(raw)?;
-        if delivered {
-            add(&self.counts.heard, frames);
-        }
-        Ok(())
+        self.deliver(raw)
     }
 
     /// A program's frames are not sent, or nobody knows whether they were: it is told by an error frame for each.
     pub fn refuse(&self, number: usize) -> io::Result<()> {
         add(&self.counts.not_sent, number);
         let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
-        self.deliver(vec![raw_error(&failed).unwrap_or_default(); number]).map(|_| ())
+        self.deliver(vec![raw_error(&failed).unwrap_or_default(); number])
     }
 
     /// The same, because the channel only listens, which is said once.
@@ -146,14 +145,14 @@ impl Lane {
         ));
         add(&self.counts.not_sent, number as usize);
         let failed = TraceEvent::TransmitFailed { tag: 0, reason: TransmitFailure::Aborted };
-        self.deliver(vec![raw_error(&failed).unwrap_or_default()]).map(|_| ())
+        self.deliver(vec![raw_error(&failed).unwrap_or_default()])
     }
 
-    /// Hands programs raw frames. What the interface does not take is counted, and told in place when it takes some again. Returns
-    /// whether all were taken; an error if the interface is gone.
-    fn deliver(&self, mut raw: Vec<RawFrame>) -> io::Result<bool> {
+    /// Hands programs raw frames. What the interface does not take is counted, and told in place when it takes some again. An error if
+    /// the interface is gone.
+    fn deliver(&self, mut raw: Vec<RawFrame>) -> io::Result<()> {
         if raw.is_empty() {
-            return Ok(true);
+            return Ok(());
         }
         let mut missing = lock(&self.missing);
         let before = *missing;
@@ -165,16 +164,18 @@ impl Lane {
             Ok(taken) => (taken, None),
             Err(error) => (0, Some(error)),
         };
+        let (delivered, not_delivered) = raw.split_at(taken);
+        add(&self.counts.heard, count_frames(delivered));
+        add(&self.counts.undelivered, count_frames(not_delivered));
         if taken > 0 {
             *missing = 0;
         }
         let told = usize::from(before > 0 && taken == 0);
         let left = (raw.len() - taken - told) as u32;
         if left == 0 && error.is_none() {
-            return Ok(true);
+            return Ok(());
         }
         *missing = missing.saturating_add(left);
-        add(&self.counts.undelivered, left as usize);
         if before == 0 {
             let why = error.as_ref().map_or_else(|| "its buffer is full".to_owned(), ToString::to_string);
             stderr::warn(&format!(
@@ -185,9 +186,14 @@ impl Lane {
         match error {
             // It has been deleted.
             Some(error) if matches!(error.raw_os_error(), Some(ENODEV | ENXIO)) => Err(error),
-            _ => Ok(false),
+            _ => Ok(()),
         }
     }
+}
+
+/// Those of them that are frames of a bus, and no errors.
+fn count_frames(raw: &[RawFrame]) -> usize {
+    raw.iter().filter(|raw| frame_of(raw).is_some()).count()
 }
 
 const ENXIO: i32 = nix::errno::Errno::ENXIO as i32;

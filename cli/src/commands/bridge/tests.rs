@@ -29,6 +29,8 @@ struct Memory {
     /// To programs.
     told: Mutex<Vec<RawFrame>>,
     is_full: AtomicBool,
+    /// It takes this many at once, if not all.
+    takes: Option<usize>,
     thrown_away: AtomicU32,
 }
 
@@ -44,8 +46,9 @@ impl Port for Arc<Memory> {
         if self.is_full.load(Ordering::Relaxed) {
             return Err(io::ErrorKind::WouldBlock.into());
         }
-        self.told.lock().unwrap().extend(frames);
-        Ok(frames.len())
+        let taken = frames.len().min(self.takes.unwrap_or(usize::MAX));
+        self.told.lock().unwrap().extend(&frames[..taken]);
+        Ok(taken)
     }
 
     fn as_fd(&self) -> Option<BorrowedFd<'_>> {
@@ -244,6 +247,30 @@ fn what_an_interface_does_not_take_is_counted_and_told_in_place() {
     assert_eq!(memory.told(), ["101#".to_owned(), format!("{lost:?}"), "105#".to_owned()]);
     assert_eq!(lane.counts.heard.load(Ordering::Relaxed), 2);
     assert_eq!(lane.counts.undelivered.load(Ordering::Relaxed), 3);
+}
+
+/// Of what was heard, whatever programs were not given is counted: by the interface, or lost before.
+#[test]
+fn frames_heard_and_frames_counted_are_all_there_were() {
+    let memory = Arc::new(Memory { takes: Some(3), ..Memory::default() });
+    let lane = Lane::new(Channel::Can1, "can0", Box::new(Arc::clone(&memory)), Known { echoes: false });
+    let of_frames = |event| TraceRecord { time_ns: 0, channel: 1, event };
+    let error = of_frames(TraceEvent::BusError { kind: None, counters: None });
+    let lost = of_frames(TraceEvent::Lost { stage: Some(LossStage::Queue), count: 10, at_least: false });
+    lane.hear(&[heard("101#"), lost, heard("102#"), heard("103#"), error, heard("104#")]).unwrap();
+    let counts = || {
+        [&lane.counts.heard, &lane.counts.lost, &lane.counts.undelivered]
+            .map(|count| count.load(Ordering::Relaxed))
+    };
+    assert_eq!(counts(), [2, 10, 2]);
+    // What was not taken, the error among it, is told first.
+    lane.hear(&[heard("105#")]).unwrap();
+    let told = TraceEvent::Lost { stage: Some(LossStage::Host), count: 3, at_least: false };
+    assert_eq!(memory.told()[3..], [format!("{told:?}"), "105#".to_owned()]);
+    assert_eq!(counts(), [3, 10, 2]);
+    assert!(!lane.counts.lost_more.load(Ordering::Relaxed));
+    lane.hear(&[of_frames(TraceEvent::GAP)]).unwrap();
+    assert!(lane.counts.lost_more.load(Ordering::Relaxed));
 }
 
 #[test]

@@ -83,9 +83,9 @@ impl Sink {
     }
 
     fn failure(&self) -> String {
+        let place = if self.to_stdout { "standard output".to_owned() } else { format!("'{}'", self.name) };
         format!(
-            "writing to '{}' failed, and what was captured before is in it; make room or choose another place",
-            self.name
+            "writing to {place} failed, and what was captured before is in it; make room or choose another place"
         )
     }
 

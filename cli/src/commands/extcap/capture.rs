@@ -22,8 +22,13 @@ use crate::losses::Losses;
 use crate::{advice, args, exit, interrupt};
 use cantap_address::Address;
 
-/// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once.
-const FLUSH_EVERY: Duration = Duration::from_millis(50);
+/// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once. Two saturated
+/// channels have 208 frames in this time.
+const FLUSH_EVERY: Duration = Duration::from_millis(5);
+/// A reader is given no more packets than this at once, and a pause before the next. dumpcap queues what it reads of several interfaces, and
+/// throws away what goes beyond 1000 packets (its option -N, which tshark and Wireshark do not pass on).
+const MOST_AT_ONCE: usize = 250;
+const PAUSE: Duration = Duration::from_millis(1);
 /// How often Wireshark learns how many frames each channel has had and lost. A reader that is gone is noticed by then at the latest.
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
 /// Wireshark opens its pipe within this time, or never.
@@ -143,17 +148,25 @@ impl Capture<'_> {
         let mut goes_on = is_read(self.writer.flush())?;
         let mut batch = Vec::new();
         let (mut flushed, mut shown) = (Instant::now(), Instant::now());
+        let mut at_once = 0;
         while goes_on && self.live.next_batch(&mut batch)? {
             for record in &batch {
                 self.traffic.push(record);
                 if self.wanted.accepts(record) {
                     self.remark(record);
                     goes_on = goes_on && is_read(self.writer.write(record))?;
+                    at_once += 1;
+                }
+                if goes_on && at_once == MOST_AT_ONCE {
+                    goes_on = is_read(self.writer.flush())?;
+                    std::thread::sleep(PAUSE);
+                    at_once = 0;
                 }
             }
             if batch.is_empty() || flushed.elapsed() >= FLUSH_EVERY {
                 goes_on = goes_on && is_read(self.writer.flush())?;
                 flushed = Instant::now();
+                at_once = 0;
             }
             if shown.elapsed() >= STATISTICS_EVERY {
                 self.traffic.show(screen, shown.elapsed());

@@ -1,5 +1,6 @@
 //! Statistics of a device's bus while it runs: a line per channel and window, as canbusload prints them.
 
+use std::collections::BTreeSet;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use cantap_analysis::stats::{Statistics, Window};
@@ -81,17 +82,28 @@ fn now_ns() -> i64 {
 struct Lines {
     shown: bool,
     colour: bool,
+    /// Channels that have had their line.
+    channels: BTreeSet<u8>,
 }
 
 impl Lines {
     fn new(shown: bool) -> Self {
-        Self { shown, colour: stderr::is_coloured() }
+        Self { shown, colour: stderr::is_coloured(), channels: BTreeSet::new() }
     }
 
     fn window(&mut self, window: &Window) {
-        if self.shown {
+        if self.shown && self.is_worth_a_line(window) {
             eprintln!("{}", line(window, self.colour));
         }
+    }
+}
+
+impl Lines {
+    /// The window in which listening ended is cut short: channels end a little after one another, and errors of before it are counted in
+    /// it, so that its rates would say of a steady bus that it was not. It is shown where it is all there is.
+    fn is_worth_a_line(&mut self, window: &Window) -> bool {
+        let is_first = self.channels.insert(window.channel);
+        is_first || !window.is_cut
     }
 }
 

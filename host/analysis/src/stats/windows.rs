@@ -46,6 +46,8 @@ pub struct Window {
     pub start_ns: i64,
     /// How long it is. The last window of a trace is cut short where the trace ends.
     pub length_ns: u64,
+    /// Whether it is cut short.
+    pub is_cut: bool,
     /// Frames that ended in it.
     pub frames: u64,
     /// Their bits, with stuff bits and intermission.
@@ -68,6 +70,7 @@ impl Window {
             channel,
             start_ns,
             length_ns,
+            is_cut: false,
             frames: 0,
             bits: 0,
             errors: 0,
@@ -311,6 +314,7 @@ impl Windows {
         let mut window = self.current;
         window.length_ns =
             u64::try_from(now_ns.saturating_sub(window.start_ns)).unwrap_or(0).min(self.length_ns);
+        window.is_cut = window.length_ns < self.length_ns;
         self.finish_load(&mut window);
         window
     }

@@ -55,14 +55,19 @@ impl Default for Decoder {
     }
 }
 
-/// A Windows SYSTEMTIME; 0 where it is none, as in a trace without a date.
-fn system_time(bytes: &[u8]) -> i64 {
+/// A Windows SYSTEMTIME; 0 in a trace without a date, `None` where it is no date.
+fn system_time(bytes: &[u8]) -> Option<i64> {
     let field = |at: usize| u16_at(bytes, 2 * at);
+    if (0..8).all(|at| field(at) == 0) {
+        return Some(0);
+    }
     let [year, month, _, day, hour, minute, second, ms] = std::array::from_fn(field);
     let of_day_ns =
         Date::of_day(u64::from(hour), u64::from(minute), u64::from(second), i64::from(ms) * 1_000_000);
     let date = |of_day_ns| Date { year: i64::from(year), month: month as u8, day: day as u8, of_day_ns };
-    of_day_ns.and_then(|of_day_ns| date(of_day_ns).time_ns()).unwrap_or(0)
+    // Years and months are longer in the file.
+    (month <= 12 && day <= 31).then_some(())?;
+    date(of_day_ns?).time_ns()
 }
 
 const EXPECTED_OBJECT: &str = "an object that begins with LOBJ";
@@ -155,9 +160,16 @@ impl Decoder {
         let len = u32_at(head, 4) as usize;
         // A cut is reported once.
         self.file_bytes = if cut { 0 } else { u64_at(head, FILE_BYTES_OFFSET) };
-        self.start_ns = self.zone.utc_ns(system_time(&head[START_OFFSET.min(head.len())..]));
+        let start = &head[START_OFFSET.min(head.len())..];
+        let date = system_time(start);
+        let no_date = date.is_none().then(|| {
+            let fields: Vec<_> = (0..8).map(|at| u16_at(start, 2 * at).to_string()).collect();
+            let expected = "a date that the times count from; they count from 1970 now";
+            Fault::malformed(expected, fields.join(" ").as_bytes())
+        });
+        self.start_ns = self.zone.utc_ns(date.unwrap_or(0));
         input.consume(if (START_OFFSET..=4096).contains(&len) { len } else { FILE_HEADER_BYTES });
-        Ok(cut.then_some(Fault::Truncated("the file header")))
+        Ok(if cut { Some(Fault::Truncated("the file header")) } else { no_date })
     }
 
     /// After the last container, `offset` bytes into the file.

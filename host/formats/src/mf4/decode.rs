@@ -18,8 +18,7 @@ use super::stream::Stream;
 use super::{ERROR_TYPES, FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
-const SIGNALS_PASSED_OVER: &str =
-    "groups of measured signals, which are no events of a bus, were passed over";
+const MEASURED: &str = "groups of measured signals";
 
 /// What a file that was not finished has to be corrected in.
 pub(super) const OPEN_COUNTERS: u16 = 1;
@@ -204,7 +203,7 @@ fn collect(
         }
         match Part::open(file, &group, open, start_ns) {
             Ok((part, signals)) => {
-                first.extend((0..signals).map(|_| Found::Note(SIGNALS_PASSED_OVER)));
+                first.extend((0..signals).map(|_| Found::LeftOut(MEASURED)));
                 parts.extend(part);
             }
             Err(Fault::Io(error)) => return Err(error.into()),

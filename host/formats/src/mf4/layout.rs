@@ -310,7 +310,8 @@ impl BusGroup {
         let begins = |prefix: &str| all.iter().any(|channel| channel.name.starts_with(prefix));
         let Some((_, events)) = FRAMES.iter().find(|(prefix, _)| begins(prefix)) else { return Ok(None) };
         let Some(clock) = clock(file, &all)? else {
-            return Err(Fault::Unsupported("a group of frames without times".into()));
+            let what = "a group of frames without times (MDF 4.2 can keep them in another group, as columns)";
+            return Err(Fault::Unsupported(what.to_owned().into()));
         };
         let find = |suffix: &str| {
             let is_it = |channel: &&Channel| {

@@ -12,6 +12,9 @@ const PIECE_BYTES: u64 = 1 << 20;
 /// The standard has at most 4 MiB in a compressed block; other programs write more. Larger is damage.
 const MAX_UNPACKED_BYTES: u64 = 256 << 20;
 
+/// In the flags of a list of 4.2.
+const INVALID_APART: u32 = 1 << 31;
+
 /// Lists of lists no deeper than this.
 const MAX_DEPTH: u32 = 4;
 
@@ -82,7 +85,7 @@ impl Stream {
     fn collect(&mut self, file: &mut Whole, link: u64, open_end: bool, depth: u32) -> Result<(), Fault> {
         let head = file.head(link)?;
         match &head.name {
-            b"##DT" | b"##SD" | b"##RD" => {
+            b"##DT" | b"##SD" | b"##RD" | b"##DV" => {
                 let begin = link + BLOCK_HEAD_BYTES;
                 let there = file.len().saturating_sub(begin);
                 let says = head.len - BLOCK_HEAD_BYTES;
@@ -113,10 +116,14 @@ impl Stream {
                     self.collect(file, list.link(0), open_end, depth + 1)?;
                 }
             }
-            b"##DL" if depth < MAX_DEPTH => {
+            b"##DL" | b"##LD" if depth < MAX_DEPTH => {
                 let (mut next, mut lists) = (link, 0);
                 while next != 0 {
-                    let list = file.block(next, *b"##DL")?;
+                    let list = file.block(next, head.name)?;
+                    if &head.name == b"##LD" && u32_at(&list.data, 0) & INVALID_APART != 0 {
+                        let what = "data in columns, which says apart from its values which of them are valid (MDF 4.2),";
+                        return Err(Fault::Unsupported(what.to_owned().into()));
+                    }
                     for data in list.links.iter().skip(1).filter(|link| **link != 0) {
                         self.collect(file, *data, open_end, depth + 1)?;
                     }
@@ -129,9 +136,7 @@ impl Stream {
             }
             name => {
                 let name = String::from_utf8_lossy(name).into_owned();
-                return Err(Fault::Unsupported(
-                    format!("data kept in columns (block {name}, MDF 4.2)").into(),
-                ));
+                return Err(Fault::malformed(format!("a block of data at {link:#x}"), name.as_bytes()));
             }
         }
         Ok(())

@@ -5,7 +5,7 @@ use std::io::Write;
 use super::super::tests;
 use super::encode::Blocks;
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
-use crate::Format;
+use crate::{Format, ReadOptions, TraceReader};
 
 const START_NS: u64 = 1_410_714_882_000_000_000;
 
@@ -136,6 +136,56 @@ fn bytes_in_a_stream_of_their_own_and_data_in_lists_plain_and_compressed_are_rea
         let (log, issues) = as_log(&file[..keep]);
         assert!(log.is_empty() && issues.len() == 1, "{keep}: {issues:?}");
     }
+}
+
+/// As asammdf writes groups in version 4.2 when it is told to: lists of another name, and blocks of values in them.
+#[test]
+fn the_lists_of_4_2_are_read_and_values_that_are_marked_apart_are_named() {
+    for flags in [0_u32, 1 << 31] {
+        let (mut blocks, group, bytes) = begin();
+        let (mut data, mut values) = (Vec::new(), Vec::new());
+        for (at, (id, value)) in records().into_iter().enumerate() {
+            data.extend(record(at, id, value.len(), values.len() as u64));
+            values.extend((value.len() as u32).to_le_bytes());
+            values.extend(value);
+        }
+        let values = blocks.push(*b"##SD", &[], &values);
+        blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+        let (first, rest) = data.split_at(1000);
+        let (second, third) = rest.split_at(500);
+        let first = packed(&mut blocks, *b"DV", first, RECORD_BYTES);
+        let second = blocks.push(*b"##DV", &[], second);
+        let third = blocks.push(*b"##DV", &[], third);
+        let fields = [&flags.to_le_bytes()[..], &[0; 4]].concat();
+        let end = blocks.push(*b"##LD", &[0, third], &fields);
+        let list = blocks.push(*b"##LD", &[end, first, second], &fields);
+        let (read, issues) = as_log(&finish(blocks, group, list, 0, 0));
+        if flags == 0 {
+            assert_eq!((read, issues), (log(), Vec::new()));
+        } else {
+            assert!(
+                read.is_empty() && issues.len() == 1 && issues[0].contains("valid (MDF 4.2)"),
+                "{issues:?}"
+            );
+        }
+    }
+}
+
+/// Found with asammdf's files: a measurement was an empty trace, which looked like success.
+#[test]
+fn a_measurement_without_a_bus_is_nothing_that_could_be_read() {
+    let (blocks, group, _) = begin();
+    let mut file = finish(blocks, group, 0, 0, 0);
+    let names: Vec<_> = memchr::memmem::find_iter(&file, b"CAN_DataFrame").collect();
+    for at in names {
+        file[at..][..3].copy_from_slice(b"Eng");
+    }
+    let source = std::io::Cursor::new(file);
+    let mut reader =
+        TraceReader::from_source("drive.mf4", source, Format::Mf4, &ReadOptions::default()).unwrap();
+    assert_eq!(reader.by_ref().count(), 0);
+    let nothing = reader.nothing_read().unwrap().to_string();
+    assert!(nothing.ends_with("mf4 without traffic of CAN: groups of measured signals (1)"), "{nothing}");
 }
 
 /// A logger writes the bytes of a frame before or behind it, and does not finish the file.

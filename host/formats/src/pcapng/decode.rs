@@ -10,9 +10,9 @@ use super::super::issue::{Fault, Place};
 use super::super::socketcan_packet::{Link, Packet, Packets};
 use super::super::text::NS_PER_S;
 use super::{
-    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, DIRECTION, END, ENHANCED_PACKET, EPB_DROPCOUNT, EPB_FLAGS,
-    IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE, OBSOLETE_PACKET, OUTBOUND, SECTION_HEADER,
-    SIMPLE_PACKET, STATISTICS,
+    BLOCK_FRAME_BYTES, BYTE_ORDER_MAGIC, COMMENT, CUSTOM, CUSTOM_NOT_COPIED, DIRECTION, END, ENHANCED_PACKET,
+    EPB_DROPCOUNT, EPB_FLAGS, IF_NAME, IF_TSOFFSET, IF_TSRESOL, INTERFACE_DESCRIPTION, LATE, NAME_RESOLUTION,
+    OBSOLETE_PACKET, OUTBOUND, SECRETS, SECTION_HEADER, SIMPLE_PACKET, STATISTICS,
 };
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
@@ -230,7 +230,9 @@ impl Decoder {
             }
             // It has no time.
             SIMPLE_PACKET => Err(Fault::Unsupported("a packet without a time".into())),
-            _ => Ok(None),
+            NAME_RESOLUTION | STATISTICS | SECRETS | CUSTOM | CUSTOM_NOT_COPIED => Ok(None),
+            // A packet could have been in it.
+            _ => Ok(Some(Found::LeftOut("blocks of kinds that are not known"))),
         }
     }
 

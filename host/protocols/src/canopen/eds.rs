@@ -103,6 +103,9 @@ impl Eds {
         for (name, section) in &sections {
             eds.sub_object(name, section);
         }
+        for (name, section) in &sections {
+            eds.check_entries(name, section);
+        }
         for list in ["mandatoryobjects", "optionalobjects", "manufacturerobjects"] {
             eds.check_list(list, sections.get(list));
         }
@@ -136,7 +139,8 @@ impl Eds {
             }
             match (line.split_once('='), current.as_ref().and_then(|name| sections.get_mut(name))) {
                 (Some((key, value)), Some(section)) => {
-                    section.keys.insert(key.trim().to_ascii_lowercase(), value.trim().to_owned());
+                    let value = without_comment(value).trim().to_owned();
+                    section.keys.insert(key.trim().to_ascii_lowercase(), value);
                 }
                 (Some(_), None) => {
                     self.issues.push(format!("line {line_number}: a key before the first section"));
@@ -221,6 +225,20 @@ impl Eds {
         }
     }
 
+    /// Entries that an object says it has, and that have no section.
+    fn check_entries(&mut self, name: &str, section: &Section) {
+        let Some(object) = index(name).and_then(|index| self.objects.get(&index)) else { return };
+        let compact = section.number("compactsubobj").unwrap_or(0) > 0;
+        if let Some(promised) =
+            section.number("subnumber").filter(|_| !compact && matches!(object.code, 6 | 8 | 9))
+            && promised != object.entries.len() as i64
+        {
+            let found = object.entries.len();
+            self.issues
+                .push(format!("line {}: [{name}] promises {promised} entries and has {found}", section.line));
+        }
+    }
+
     /// What the lists of objects promise must be there.
     fn check_list(&mut self, list: &str, section: Option<&Section>) {
         let Some(section) = section else { return };
@@ -251,6 +269,12 @@ impl Eds {
     }
 }
 
+/// CiA 306 has comments in lines of their own; many tools also write them behind a value and a blank.
+fn without_comment(value: &str) -> &str {
+    let mark = value.match_indices(';').map(|(at, _)| at).find(|&at| value[..at].ends_with([' ', '\t']));
+    mark.map_or(value, |at| &value[..at])
+}
+
 /// Four hexadecimal digits and nothing else.
 fn index(name: &str) -> Option<u16> {
     (name.len() == 4 && name.bytes().all(|byte| byte.is_ascii_hexdigit()))
@@ -264,7 +288,7 @@ mod tests {
 
     const SHEET: &str = "\u{FEFF}; a comment\n[DeviceInfo]\nVendorName=Us\nProductName=Drive\n[DeviceComissioning]\nNodeID=0x05\n\
         [MandatoryObjects]\nSupportedObjects=3\n1=0x1000\n2=0x1018\n3=0x1001\n[1000]\nParameterName=Device type\nObjectType=0x7\n\
-        DataType=0x0007\nAccessType=ro\nDefaultValue=0x191\n[1018]\nParameterName=Identity\nObjectType=9\nSubNumber=2\n\
+        DataType=0x0007\nAccessType=ro\nDefaultValue=0x191\n[1018]\nParameterName=Identity ; of the maker\nObjectType=9\nSubNumber=3\n\
         [1018sub0]\nParameterName=Entries\nDataType=5\nAccessType=ro\nDefaultValue=1\n[1018Sub1]\nParameterName=Vendor\n\
         DataType=7\nAccessType=ro\n[1800]\nParameterName=TPDO\nObjectType=9\n[1800sub1]\nParameterName=COB\nDataType=7\n\
         DefaultValue=$NODEID+0x180\n[2000]\nParameterName=Table\nObjectType=8\nDataType=0x6\nAccessType=rw\nCompactSubObj=3\n\
@@ -286,6 +310,7 @@ mod tests {
             [
                 "line 53: neither a section nor a key: rubbish",
                 "line 51: [3000sub1] belongs to an object that has no section",
+                "line 18: [1018] promises 3 entries and has 2",
                 "[mandatoryobjects] names 1001, which has no section",
             ]
         );

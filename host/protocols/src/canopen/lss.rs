@@ -52,7 +52,13 @@ impl Lss {
     pub fn take(&mut self, record: &TraceRecord, from_master: bool, data: &[u8]) -> Option<Event> {
         let (&service, rest) = data.split_first()?;
         let kind = if from_master { "lss" } else { "lss_answer" };
-        let mut event = Event::new(Protocol::CanOpen, record, kind, title(service)?);
+        let known = title(service);
+        let mut event = Event::new(Protocol::CanOpen, record, kind, known.unwrap_or("LSS, unknown service"));
+        if known.is_none() {
+            event.fields.push(Field::hex("service", service, 2));
+            event.fields.push(Field::bytes("data", rest));
+            return Some(event);
+        }
         let word =
             |bytes: &[u8]| bytes.iter().take(4).rev().fold(0_u64, |word, byte| word << 8 | u64::from(*byte));
         let fields = &mut event.fields;

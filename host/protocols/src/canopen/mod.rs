@@ -18,7 +18,7 @@ mod types;
 
 pub use encode::{BadValue, encode, type_named};
 pub use names::{abort as abort_text, state as state_name};
-pub(crate) use sdo::crc_of;
+pub use sdo::crc_of;
 pub use types::known as known_type;
 
 use std::borrow::Cow;
@@ -106,13 +106,26 @@ struct Bus {
 pub struct CanOpen {
     buses: FxHashMap<u8, Bus>,
     sheets: Vec<Sheet>,
+    /// Identifiers of PDOs that the sheets say, where they are not the predefined ones.
+    sheet_ids: FxHashMap<u16, (u8, u16)>,
     sweep_ns: i64,
 }
 
 impl CanOpen {
     /// With the nodes' sheets, where there are some.
     pub fn new(sheets: Vec<Sheet>) -> Self {
-        Self { sheets, ..Self::default() }
+        let mut sheet_ids = FxHashMap::default();
+        for sheet in &sheets {
+            let nodes = sheet.node.map_or(1..=127, |node| node..=node);
+            for node in nodes {
+                let own = sheets.iter().any(|other| other.node == Some(node));
+                if sheet.node.is_some() || !own {
+                    let ids = pdo::sheet_ids(&sheet.eds, node, sheet.node.is_some());
+                    sheet_ids.extend(ids.map(|(id, parameter)| (id, (node, parameter))));
+                }
+            }
+        }
+        Self { sheets, sheet_ids, ..Self::default() }
     }
 
     fn sheet(sheets: &[Sheet], node: u8) -> Option<&Eds> {
@@ -122,7 +135,9 @@ impl CanOpen {
 
     fn frame(&mut self, record: &TraceRecord, id: u16, remote: bool, data: &[u8], events: &mut Vec<Event>) {
         let sheets = &self.sheets;
-        let bus = self.buses.entry(record.channel).or_default();
+        let sheet_ids = &self.sheet_ids;
+        let fresh = || Bus { pdo_ids: sheet_ids.clone(), ..Bus::default() };
+        let bus = self.buses.entry(record.channel).or_insert_with(fresh);
         let node = (id & 0x7F) as u8;
         match id {
             _ if remote => {
@@ -138,6 +153,9 @@ impl CanOpen {
                     event.to = if node == 0 { Party::Everyone } else { Party::Node(node) };
                     event.fields.push(Field::number("command", command));
                     events.push(event);
+                } else {
+                    let fault = if data.len() == 2 { "an unknown command" } else { "a command has 2 bytes" };
+                    events.push(malformed(record, "nmt", "network management", fault));
                 }
             }
             0x80 => sync(bus, record, data, events),
@@ -149,6 +167,13 @@ impl CanOpen {
                     event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
                     event.fields.push(Field::hex("register", register, 2).meaning(register_text(register)));
                     event.fields.push(Field::bytes("manufacturer", rest));
+                    // As long as it should be, or else what is there.
+                    event.trouble =
+                        (rest.len() != 5).then_some(Trouble::Malformed("an emergency has 8 bytes"));
+                    events.push(event);
+                } else {
+                    let mut event = malformed(record, "emergency", "emergency", "an emergency has 8 bytes");
+                    event.from = Party::Node(node);
                     events.push(event);
                 }
             }
@@ -160,6 +185,8 @@ impl CanOpen {
                     event.fields.push(Field::number("days_since_1984", days));
                     event.fields.push(Field::real("time_of_day_s", f64::from(ms) / 1000.0, "s"));
                     events.push(event);
+                } else {
+                    events.push(malformed(record, "time", "time", "a time has 6 bytes"));
                 }
             }
             0x7E4 | 0x7E5 => events.extend(bus.lss.take(record, id == 0x7E5, data)),
@@ -204,9 +231,8 @@ impl CanOpen {
                 events.push(entry.pdos.event(record, node, number, data, sheet));
             }
             _ => {
-                if let Some(&(node, number)) = bus.pdo_ids.get(&id)
-                    && let Some(entry) = bus.nodes.get_mut(&node)
-                {
+                if let Some(&(node, number)) = bus.pdo_ids.get(&id) {
+                    let entry = bus.nodes.entry(node).or_default();
                     events.push(entry.pdos.event(record, node, number, data, Self::sheet(sheets, node)));
                 }
             }
@@ -302,6 +328,14 @@ fn event(record: &TraceRecord, kind: &'static str, title: impl Into<Cow<'static,
     Event::new(Protocol::CanOpen, record, kind, title)
 }
 
+/// An event of what is not as the protocol has it.
+fn malformed(record: &TraceRecord, kind: &'static str, title: &'static str, fault: &'static str) -> Event {
+    let mut event = event(record, kind, title);
+    event.fields.push(Field::bytes("data", &event.data));
+    event.trouble = Some(Trouble::Malformed(fault));
+    event
+}
+
 fn register_text(register: u8) -> Option<String> {
     const BITS: [&str; 8] = [
         "generic",
@@ -350,8 +384,14 @@ fn guard(bus: &mut Bus, record: &TraceRecord, node: u8, events: &mut Vec<Event>)
 
 /// A heartbeat, a boot-up, or the answer to a guard.
 fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], events: &mut Vec<Event>) {
-    let &[byte] = data else { return };
-    let Some(title) = names::state(byte & 0x7F) else { return };
+    let known = if let &[byte] = data { names::state(byte & 0x7F).map(|title| (byte, title)) } else { None };
+    let Some((byte, title)) = known else {
+        let fault = if data.len() == 1 { "an unknown state" } else { "a state has 1 byte" };
+        let mut said = malformed(record, "state", "state", fault);
+        said.from = Party::Node(node);
+        events.push(said);
+        return;
+    };
     let (state, toggle) = (byte & 0x7F, byte & 0x80 != 0);
     let entry = bus.nodes.entry(node).or_default();
     let before = entry.state.replace(state);

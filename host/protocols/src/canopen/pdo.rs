@@ -4,11 +4,35 @@ use rustc_hash::FxHashMap;
 
 use super::eds::Eds;
 use super::{names, sdo, types};
-use crate::{Event, Field, Party, Protocol};
+use crate::{Event, Field, Party, Protocol, Trouble};
 use cantap_trace::TraceRecord;
 
 /// Mapping parameters of a node that are kept: 512 PDOs with eight entries each.
 const MOST_ENTRIES: usize = 512 * 9;
+
+/// The identifier that a communication parameter of a node sets, where it is not the predefined one.
+fn own_id(value: u32, index: u16, node: u8) -> Option<u16> {
+    // Bit 31: it does not exist; bit 29: an extended identifier.
+    let id = (value & 0x7FF) as u16;
+    let place = index & 0x1FF;
+    let predefined =
+        (place < 4).then(|| u16::from(node) + 0x80 * (2 * place + if index < 0x1800 { 4 } else { 3 }));
+    (value & 0xA000_0000 == 0 && id != 0 && Some(id) != predefined).then_some(id)
+}
+
+/// Identifiers that a sheet gives a node's PDOs, each with its communication parameter. Where the sheet is `of_the_node`, all of them; else
+/// those that the node's number is a part of.
+pub fn sheet_ids(eds: &Eds, node: u8, of_the_node: bool) -> impl Iterator<Item = (u16, u16)> + '_ {
+    let parameters =
+        [0x1400..=0x15FF, 0x1800..=0x19FF].into_iter().flat_map(|range| eds.objects.range(range));
+    parameters.filter_map(move |(&index, object)| {
+        let text = &object.entries.get(&1)?.value;
+        if !of_the_node && !text.to_ascii_uppercase().contains("$NODEID") {
+            return None;
+        }
+        Some((own_id(eds.value_of(index, 1, node)?, index, node)?, index))
+    })
+}
 
 /// One node's PDOs.
 #[derive(Default)]
@@ -36,6 +60,11 @@ impl Pdos {
             }
             return false;
         };
+        if let (0x1600..=0x17FF | 0x1A00..=0x1BFF, 0) = (transfer.index, transfer.sub) {
+            // Sent without its size: the first byte is the number.
+            self.map(transfer.index, 0, bytes[0].into());
+            return false;
+        }
         let value = u32::from_le_bytes(bytes);
         match (transfer.index, transfer.sub) {
             (0x1600..=0x17FF | 0x1A00..=0x1BFF, 1..=64) => {
@@ -43,11 +72,7 @@ impl Pdos {
                 false
             }
             (index @ (0x1400..=0x15FF | 0x1800..=0x19FF), 1) => {
-                // Bit 31: it does not exist; bit 29: an extended identifier.
-                let id = (value & 0x7FF) as u16;
-                let predefined =
-                    u16::from(node) + 0x80 * (2 * (index & 0x1FF) + if index < 0x1800 { 4 } else { 3 });
-                if value & 0xA000_0000 == 0 && (id != predefined || (index & 0x1FF) > 3) {
+                if let Some(id) = own_id(value, index, node) {
                     self.ids.insert(index, id);
                 } else {
                     self.ids.remove(&index);
@@ -92,11 +117,15 @@ impl Pdos {
             let heard = self.mapped.get(&(mapping, sub)).copied();
             heard.or_else(|| sheet.and_then(|eds| eds.value_of(mapping, sub, node)))
         };
-        let mut at = 0;
+        let (mut at, mut is_short) = (0, false);
         for sub in 1..=entry(0).unwrap_or(0).min(64) as u8 {
             let Some(mapped) = entry(sub) else { break };
             let (index, of, bits) = ((mapped >> 16) as u16, (mapped >> 8) as u8, (mapped & 0xFF) as usize);
-            if bits == 0 || at + bits > data.len() * 8 {
+            if bits == 0 {
+                break;
+            }
+            if at + bits > data.len() * 8 {
+                is_short = true;
                 break;
             }
             let bytes = cut(data, at, bits);
@@ -116,7 +145,11 @@ impl Pdos {
         if at == 0 {
             event.fields.push(Field::bytes("data", data));
         } else if at < data.len() * 8 {
-            event.fields.push(Field::bytes("rest", &data[at.div_ceil(8)..]));
+            // From the bit on that nothing is mapped to.
+            event.fields.push(Field::bytes("rest", &cut(data, at, data.len() * 8 - at)));
+        }
+        if is_short {
+            event.trouble = Some(Trouble::Malformed("shorter than what is mapped to it"));
         }
         event
     }

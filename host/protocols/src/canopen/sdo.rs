@@ -71,6 +71,8 @@ pub struct Sdo {
     block_start: usize,
     block_next: u8,
     last_segment: bool,
+    /// What comes belongs to a transfer that has ended or was not heard, which was said.
+    is_orphan: bool,
     /// Both sides have said that they check a CRC.
     crc: [bool; 2],
 }
@@ -84,6 +86,7 @@ impl Default for Sdo {
             block_start: 0,
             block_next: 1,
             last_segment: false,
+            is_orphan: false,
             crc: [false; 2],
         }
     }
@@ -103,9 +106,12 @@ impl Sdo {
             6 => matches!(b0 & 1, 0),
             _ => false,
         };
-        let begins = from_client && self.phase == Phase::Command && initiates;
+        // While a block comes from the server, a client that begins anew has left it.
+        let begins = from_client && self.phase != Phase::FromClient && initiates;
         if begins {
             behind = self.end(Trouble::Overlapped);
+            self.phase = Phase::Command;
+            self.is_orphan = false;
         }
         if let Some(open) = &mut self.open {
             open.time_ns = time_ns;
@@ -134,6 +140,8 @@ impl Sdo {
     pub fn end(&mut self, trouble: Trouble) -> Option<SdoTransfer> {
         let open = self.open.take()?;
         self.phase = Phase::Command;
+        // What still comes of it was said with it.
+        self.is_orphan = true;
         Some(SdoTransfer { trouble: open.trouble.or(Some(trouble)), ..open })
     }
 
@@ -170,7 +178,7 @@ impl Sdo {
                 let Some(open) =
                     self.open.as_mut().filter(|open| open.is_write && open.mode == Mode::Segmented)
                 else {
-                    return Some(headless(time_ns, &bytes, Trouble::Headless));
+                    return self.orphan(headless(time_ns, &bytes, Trouble::Headless));
                 };
                 if (b0 & 0x10 != 0) != self.toggle {
                     return self.end(wrong_toggle(self.toggle));
@@ -234,13 +242,17 @@ impl Sdo {
             if b0 >> 5 == 2 && b0 & 2 != 0 {
                 first_bytes(&mut transfer, b0, true, b0 & 1 != 0, bytes);
             }
-            return Some(SdoTransfer { trouble: Some(Trouble::Headless), ..transfer });
+            let transfer = SdoTransfer { trouble: Some(Trouble::Headless), ..transfer };
+            // Segments and their confirmations name no object.
+            return if matches!(b0 >> 5, 0 | 1) { self.orphan(transfer) } else { Some(transfer) };
         };
         match b0 >> 5 {
             3 => (open.mode == Mode::Expedited).then(|| self.done()).flatten(),
             2 => {
                 let (expedited, sized) = (b0 & 2 != 0, b0 & 1 != 0);
                 open.mode = if expedited { Mode::Expedited } else { Mode::Segmented };
+                // Also in answer to a request for blocks, which a server need not speak.
+                self.toggle = false;
                 first_bytes(open, b0, expedited, sized, bytes);
                 if expedited { self.done() } else { None }
             }
@@ -288,6 +300,11 @@ impl Sdo {
             }
             _ => None,
         }
+    }
+
+    /// Segments of a transfer that is not under way are said once.
+    fn orphan(&mut self, transfer: SdoTransfer) -> Option<SdoTransfer> {
+        (!std::mem::replace(&mut self.is_orphan, true)).then_some(transfer)
     }
 
     fn begin_block(&mut self) {

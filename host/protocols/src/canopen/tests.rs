@@ -263,3 +263,87 @@ fn timeouts_are_those_that_were_set() {
     assert_eq!(stopped.len(), 1, "{guarded:?}");
     assert!(stopped[0].ends_with("nothing came for 300 ms"), "{guarded:?}");
 }
+
+/// A drive whose sheet has identifiers of its own, for its number (first) and for any (second).
+#[test]
+fn a_sheet_says_which_identifiers_pdos_have() {
+    const SHEET: &str = "[DeviceInfo]\n[1800]\nParameterName=T\nObjectType=9\n[1800sub1]\nDataType=7\nDefaultValue=$NODEID+0x400001A0\n\
+        [1A00]\nParameterName=M\nObjectType=9\n[1A00sub0]\nDataType=5\nDefaultValue=2\n[1A00sub1]\nDataType=7\nDefaultValue=0x20000003\n\
+        [1A00sub2]\nDataType=7\nDefaultValue=0x2001000D\n[1804]\nParameterName=T5\nObjectType=9\n[1804sub1]\nDataType=7\n\
+        DefaultValue=0x80000000\n[1805]\nParameterName=T6\nObjectType=9\n[1805sub1]\nDataType=7\nDefaultValue=0x6A5\n\
+        [2000]\nParameterName=Mode\nDataType=5\n[2001]\nParameterName=Speed\nDataType=6\n";
+    let said = |node: Option<u8>, frames: &[(f64, &str)]| {
+        let sheet = Sheet { node, eds: Eds::parse(SHEET.as_bytes()).into() };
+        testing::said(CanOpen::new(vec![sheet]), frames)
+    };
+    // Three and thirteen bits: 5, and 0x123.
+    for node in [Some(5), None] {
+        assert_eq!(said(node, &[(0.0, "1A5#1D09")]), ["canopen 5 TPDO1: Mode 5, Speed 291"]);
+        assert_eq!(
+            said(node, &[(0.0, "1A5#1D")]),
+            ["canopen 5 TPDO1: Mode 5, rest 03; malformed: shorter than what is mapped to it"]
+        );
+    }
+    assert_eq!(said(Some(5), &[(0.0, "6A5#01")]), ["canopen 5 TPDO6: data 01"]);
+    assert_eq!(said(None, &[(0.0, "6A5#01")]), [""; 0]);
+}
+
+#[test]
+fn what_is_not_as_the_protocol_has_it_is_said() {
+    let all = said(&[
+        (0.0, "000#01"),
+        (1.0, "000#7705"),
+        (2.0, "085#00"),
+        (3.0, "100#00"),
+        (4.0, "705#03"),
+        (5.0, "7E5#99"),
+    ]);
+    for (line, expected) in all.iter().zip([
+        "network management: data 01; malformed: a command has 2 bytes",
+        "network management: data 77 05; malformed: an unknown command",
+        "5 emergency: data 00; malformed: an emergency has 8 bytes",
+        "time: data 00; malformed: a time has 6 bytes",
+        "5 state: data 03; malformed: an unknown state",
+        "LSS, unknown service: service 0x99, data nothing",
+    ]) {
+        assert!(line.ends_with(expected), "{line}");
+    }
+    assert_eq!(all.len(), 6, "{all:?}");
+}
+
+#[test]
+fn a_transfer_that_another_one_leaves_behind_is_said() {
+    // A block is being read when the client asks for something else.
+    let all = said(&[
+        (0.0, "605#A408100014000000"),
+        (1.0, "585#C608100014000000"),
+        (2.0, "605#A300000000000000"),
+        (3.0, "585#0141414141414141"),
+        (4.0, "605#4000100000000000"),
+        (5.0, "585#4300100091010000"),
+    ]);
+    assert_eq!(all.len(), 2, "{all:?}");
+    assert!(
+        all[0].contains("SDO read 1008:00") && all[0].ends_with("the next one began before it was complete"),
+        "{all:?}"
+    );
+    assert!(all[1].contains("value 0x00000191"), "{all:?}");
+    // Segments without a beginning are said once.
+    let orphans = said(&[
+        (0.0, "605#0041414141414141"),
+        (1.0, "585#2000000000000000"),
+        (2.0, "605#1041414141414141"),
+        (3.0, "585#3000000000000000"),
+    ]);
+    assert_eq!(orphans.len(), 1, "{orphans:?}");
+    // A server that does not speak blocks answers otherwise.
+    let without = said(&[
+        (0.0, "605#A408100014000000"),
+        (1.0, "585#4108100009000000"),
+        (2.0, "605#6000000000000000"),
+        (3.0, "585#0041424344454647"),
+        (4.0, "605#7000000000000000"),
+        (5.0, "585#1B48490000000000"),
+    ]);
+    assert!(without.len() == 1 && without[0].contains("value \"ABCDEFGHI\""), "{without:?}");
+}

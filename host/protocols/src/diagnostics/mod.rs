@@ -6,8 +6,10 @@
 //! Memory: that of [`crate::iso_tp`], and 256 requests that wait for their responses.
 
 mod dtc;
+mod monitors;
 mod names;
 mod obd;
+mod reports;
 #[cfg(test)]
 mod tests;
 mod uds;
@@ -38,15 +40,27 @@ const RESPONSE_PENDING: u8 = 0x78;
 /// Senders that are known to speak KWP2000.
 const MOST_KWP: usize = 1024;
 
+/// Servers that have said to one request that their response is pending.
+const MOST_PENDING: usize = 64;
+
 /// A request that waits.
 #[derive(Clone, Debug)]
 struct Waiting {
     request: Transfer,
-    /// How often the server said that the response is pending, and when last.
-    pending: u32,
+    /// A positive response was asked for. One that was not still brings refusals, and responses that were pending.
+    is_wanted: bool,
+    /// Who said that the response is pending and has not answered since, and how often.
+    pending: Vec<(Endpoint, u32)>,
     until_ns: i64,
     /// Responses so far; a request to all may have several.
     answers: u32,
+    frames_lost: bool,
+}
+
+/// A request as it was when this response came.
+struct Answered {
+    request: Transfer,
+    pending: u32,
     frames_lost: bool,
 }
 
@@ -55,6 +69,8 @@ struct Waiting {
 pub struct Diagnostics {
     transport: Transport,
     waiting: VecDeque<Waiting>,
+    /// No request has waited for too long before this time.
+    due_ns: i64,
     /// Both sides of those who used a service that only KWP2000 has.
     speaks_kwp: FxHashSet<(u8, Endpoint)>,
     transfers: Vec<Transfer>,
@@ -104,16 +120,20 @@ impl Diagnostics {
         }
         transfer.to = transfer.to.or_else(|| self.transport.partner(transfer.channel, transfer.from));
         let is_uds = self.service(&transfer, sid).is_some_and(|(protocol, _)| protocol == Protocol::Uds);
-        if is_uds && uds::is_response_suppressed(&transfer.data) {
+        // KWP2000 has a value of its own for it (ISO 14230-3, 6.4).
+        let is_wanted =
+            !(is_uds && uds::is_response_suppressed(&transfer.data) || transfer.data == [0x3E, 0x02]);
+        if !is_wanted {
             let mut event = self.event(&transfer, None, "request");
             event.fields.push(Field::text("response", "not wanted"));
             events.push(event);
-            return;
         }
-        // Who asks again does not wait for the first answer any longer.
+        // Who asks again does not wait for the first answer any longer. What wants no response is said in between.
         let same = |waiting: &Waiting| {
-            (waiting.request.channel, waiting.request.from, waiting.request.to)
-                == (transfer.channel, transfer.from, transfer.to)
+            let before = &waiting.request;
+            (before.channel, before.from, before.to) == (transfer.channel, transfer.from, transfer.to)
+                && (waiting.is_wanted == is_wanted)
+                && (is_wanted || before.data.first() == Some(&sid))
         };
         if let Some(place) = self.waiting.iter().position(same) {
             self.give_up(place, Trouble::Overlapped, events);
@@ -122,8 +142,17 @@ impl Diagnostics {
             self.give_up(0, Trouble::GivenUp, events);
         }
         let until_ns = transfer.time_ns.saturating_add(RESPONSE_NS);
+        self.due_ns = self.due_ns.min(until_ns);
         let frames_lost = transfer.frames_lost;
-        self.waiting.push_back(Waiting { request: transfer, pending: 0, until_ns, answers: 0, frames_lost });
+        let pending = Vec::new();
+        self.waiting.push_back(Waiting {
+            request: transfer,
+            is_wanted,
+            pending,
+            until_ns,
+            answers: 0,
+            frames_lost,
+        });
     }
 
     /// The request that a response to `sid` is for.
@@ -137,13 +166,14 @@ impl Diagnostics {
                 && waiting.request.to.is_none()
                 && waiting.request.from.id.is_extended() == response.from.id.is_extended()
         };
-        self.waiting.iter().position(physical).or_else(|| self.waiting.iter().position(functional))
+        // The last one of its kind: one that wanted no response may still be there before it.
+        self.waiting.iter().rposition(physical).or_else(|| self.waiting.iter().rposition(functional))
     }
 
     fn response(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
         match self.asked(transfer, transfer.data[0] & !0x40) {
             Some(place) => {
-                let answered = self.answered(place);
+                let answered = self.answered(place, transfer.from);
                 events.push(self.event(&answered.request, Some((transfer, &answered)), "exchange"));
             }
             None => events.push(self.unasked(transfer)),
@@ -151,14 +181,18 @@ impl Diagnostics {
     }
 
     /// The request as it was until now; one to a single server waits no longer.
-    fn answered(&mut self, place: usize) -> Waiting {
+    fn answered(&mut self, place: usize, by: Endpoint) -> Answered {
         let waiting = &mut self.waiting[place];
         waiting.answers += 1;
-        let answered = waiting.clone();
-        if waiting.request.to.is_some() {
-            self.waiting.remove(place);
+        let said = waiting.pending.iter().position(|(server, _)| *server == by);
+        let pending = said.map_or(0, |place| waiting.pending.swap_remove(place).1);
+        let frames_lost = waiting.frames_lost;
+        if waiting.request.to.is_some()
+            && let Some(waiting) = self.waiting.remove(place)
+        {
+            return Answered { request: waiting.request, pending, frames_lost };
         }
-        answered
+        Answered { request: self.waiting[place].request.clone(), pending, frames_lost }
     }
 
     fn refusal(&mut self, transfer: &Transfer, events: &mut Vec<Event>) {
@@ -169,11 +203,15 @@ impl Diagnostics {
         };
         if nrc == RESPONSE_PENDING {
             let waiting = &mut self.waiting[place];
-            waiting.pending += 1;
+            match waiting.pending.iter().position(|(server, _)| *server == transfer.from) {
+                Some(place) => waiting.pending[place].1 += 1,
+                None if waiting.pending.len() < MOST_PENDING => waiting.pending.push((transfer.from, 1)),
+                None => {}
+            }
             waiting.until_ns = transfer.time_ns.saturating_add(PENDING_NS);
             return;
         }
-        let answered = self.answered(place);
+        let answered = self.answered(place, transfer.from);
         let mut event = self.event(&answered.request, Some((transfer, &answered)), "exchange");
         event.kind = "refusal";
         events.push(event);
@@ -187,7 +225,7 @@ impl Diagnostics {
     }
 
     /// One transfer, or a request with its response, as an event.
-    fn event(&self, first: &Transfer, response: Option<(&Transfer, &Waiting)>, kind: &'static str) -> Event {
+    fn event(&self, first: &Transfer, response: Option<(&Transfer, &Answered)>, kind: &'static str) -> Event {
         let refused = |data: &[u8]| data[0] == 0x7F && data.len() >= 3;
         let sid = if refused(&first.data) { first.data[1] } else { first.data[0] & !0x40 };
         let (protocol, title) =
@@ -236,9 +274,9 @@ impl Diagnostics {
         if !is_request && first.to.is_none() {
             event.to = Party::Unknown;
         }
-        if let Some((response, waiting)) = response {
-            if waiting.pending > 0 {
-                event.fields.push(Field::number("pending", waiting.pending).unit("times"));
+        if let Some((response, answered)) = response {
+            if answered.pending > 0 {
+                event.fields.push(Field::number("pending", answered.pending).unit("times"));
             }
             // To all: who answered is what matters.
             if first.to.is_none() {
@@ -248,7 +286,7 @@ impl Diagnostics {
             event.time_ns = response.time_ns;
             event.response_ns = Some(response.start_ns.saturating_sub(first.time_ns));
             event.frames += response.frames;
-            event.frames_lost |= waiting.frames_lost || response.frames_lost;
+            event.frames_lost |= answered.frames_lost || response.frames_lost;
             event.data.clone_from(&response.data);
         }
         event
@@ -256,35 +294,44 @@ impl Diagnostics {
 
     /// Nobody answers the request at this place any more.
     fn give_up(&mut self, place: usize, trouble: Trouble, events: &mut Vec<Event>) {
-        let Some(waiting) = self.waiting.remove(place) else { return };
-        if waiting.answers > 0 {
-            return;
+        let Some(mut waiting) = self.waiting.remove(place) else { return };
+        // Who said that the response is pending owes one, whatever others have answered.
+        let mut silent: Vec<_> = waiting.pending.drain(..).map(|(by, times)| (Some(by), times)).collect();
+        if silent.is_empty() && waiting.is_wanted && waiting.answers == 0 {
+            silent.push((None, 0));
         }
-        let mut event = self.event(&waiting.request, None, "no_response");
-        event.fields.push(Field::text("response", "none"));
-        if waiting.pending > 0 {
-            event.fields.push(Field::number("pending", waiting.pending).unit("times"));
+        for (by, pending) in silent {
+            let mut event = self.event(&waiting.request, None, "no_response");
+            event.fields.push(Field::text("response", "none"));
+            if pending > 0 {
+                event.fields.push(Field::number("pending", pending).unit("times"));
+            }
+            if let (None, Some(by)) = (waiting.request.to, by) {
+                event.to = by.into();
+                event.fields.push(Field::text("asked", "all"));
+            }
+            if let Trouble::Timeout { .. } = trouble {
+                event.time_ns = waiting.until_ns;
+            }
+            event.trouble = Some(trouble);
+            event.frames_lost |= waiting.frames_lost;
+            events.push(event);
         }
-        if let Trouble::Timeout { .. } = trouble {
-            event.time_ns = waiting.until_ns;
-        }
-        event.trouble = Some(trouble);
-        event.frames_lost |= waiting.frames_lost;
-        events.push(event);
     }
 
     fn expire(&mut self, now_ns: i64, events: &mut Vec<Event>) {
         while let Some(place) = self.waiting.iter().position(|waiting| waiting.until_ns < now_ns) {
             let waiting = &self.waiting[place];
-            let waited = if waiting.pending > 0 { PENDING_NS } else { RESPONSE_NS };
+            let waited = if waiting.pending.is_empty() { RESPONSE_NS } else { PENDING_NS };
             self.give_up(place, Trouble::Timeout { after_ms: (waited / 1_000_000) as u32 }, events);
         }
+        self.due_ns = self.waiting.iter().map(|waiting| waiting.until_ns).min().unwrap_or(i64::MAX);
     }
 }
 
 impl Assembler for Diagnostics {
     fn take(&mut self, record: &TraceRecord, events: &mut Vec<Event>) {
-        if self.waiting.front().is_some_and(|waiting| waiting.until_ns < record.time_ns) {
+        if self.due_ns < record.time_ns {
             self.expire(record.time_ns, events);
         }
         if is_gap(&record.event) {

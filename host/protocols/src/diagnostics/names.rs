@@ -1,7 +1,7 @@
 //! Numbers and what they are called: services, sub-functions, identifiers, reasons.
 
 /// Services of ISO 14229-1:2020, table 2, and 27.
-const UDS_SERVICES: [(u8, &str); 26] = [
+const UDS_SERVICES: [(u8, &str); 27] = [
     (0x10, "DiagnosticSessionControl"),
     (0x11, "ECUReset"),
     (0x14, "ClearDiagnosticInformation"),
@@ -24,6 +24,8 @@ const UDS_SERVICES: [(u8, &str); 26] = [
     (0x38, "RequestFileTransfer"),
     (0x3D, "WriteMemoryByAddress"),
     (0x3E, "TesterPresent"),
+    // Until ISO 14229-1:2013.
+    (0x83, "AccessTimingParameter"),
     (0x84, "SecuredDataTransmission"),
     (0x85, "ControlDTCSetting"),
     (0x86, "ResponseOnEvent"),
@@ -31,7 +33,7 @@ const UDS_SERVICES: [(u8, &str); 26] = [
 ];
 
 /// Services of ISO 14230-3 that ISO 14229 does not have.
-const KWP_SERVICES: [(u8, &str); 15] = [
+const KWP_SERVICES: [(u8, &str); 14] = [
     (0x12, "readFreezeFrameData"),
     (0x13, "readDiagnosticTroubleCodes"),
     (0x17, "readStatusOfDiagnosticTroubleCodes"),
@@ -46,11 +48,10 @@ const KWP_SERVICES: [(u8, &str); 15] = [
     (0x3B, "writeDataByLocalIdentifier"),
     (0x81, "startCommunication"),
     (0x82, "stopCommunication"),
-    (0x83, "accessTimingParameter"),
 ];
 
 /// Services that both have, by their names in ISO 14230-3 where those differ.
-const KWP_SHARED: [(u8, &str); 8] = [
+const KWP_SHARED: [(u8, &str); 9] = [
     (0x10, "startDiagnosticSession"),
     (0x14, "clearDiagnosticInformation"),
     (0x22, "readDataByCommonIdentifier"),
@@ -59,6 +60,7 @@ const KWP_SHARED: [(u8, &str); 8] = [
     (0x31, "startRoutineByLocalIdentifier"),
     (0x38, "startRoutineByAddress"),
     (0x3E, "testerPresent"),
+    (0x83, "accessTimingParameter"),
 ];
 
 /// Services of SAE J1979.
@@ -176,7 +178,7 @@ const DATA_IDENTIFIERS: [(u16, &str); 34] = [
 ];
 
 /// Sub-functions by service.
-const SUB_FUNCTIONS: [(u8, u8, &str); 78] = [
+const SUB_FUNCTIONS: [(u8, u8, &str); 82] = [
     (0x10, 1, "default"),
     (0x10, 2, "programming"),
     (0x10, 3, "extended"),
@@ -243,6 +245,10 @@ const SUB_FUNCTIONS: [(u8, u8, &str); 78] = [
     (0x38, 5, "read folder"),
     (0x38, 6, "resume file"),
     (0x3E, 0, "zero"),
+    (0x83, 1, "read extended timing"),
+    (0x83, 2, "set default timing"),
+    (0x83, 3, "read active timing"),
+    (0x83, 4, "set timing"),
     (0x85, 1, "on"),
     (0x85, 2, "off"),
     (0x86, 0, "stop"),
@@ -309,15 +315,15 @@ pub fn data_identifier(did: u16) -> Option<&'static str> {
 pub fn sub_function(sid: u8, sub: u8) -> Option<&'static str> {
     let named = SUB_FUNCTIONS.iter().find(|(of, number, _)| (*of, *number) == (sid, sub));
     named.map(|(.., name)| *name).or(match (sid, sub) {
-        (0x27, 1..=0x42) if sub % 2 == 1 => Some("request seed"),
-        (0x27, 1..=0x42) => Some("send key"),
+        (0x27, 1..=0x7E) if sub % 2 == 1 => Some("request seed"),
+        (0x27, 1..=0x7E) => Some("send key"),
         _ => None,
     })
 }
 
 /// Whether the service's second byte is a sub-function whose highest bit suppresses the response.
 pub const fn has_sub_function(sid: u8) -> bool {
-    matches!(sid, 0x10 | 0x11 | 0x19 | 0x27 | 0x28 | 0x29 | 0x2C | 0x31 | 0x3E | 0x85 | 0x86 | 0x87)
+    matches!(sid, 0x10 | 0x11 | 0x19 | 0x27 | 0x28 | 0x29 | 0x2C | 0x31 | 0x3E | 0x83 | 0x85 | 0x86 | 0x87)
 }
 
 #[cfg(test)]

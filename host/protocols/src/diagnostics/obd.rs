@@ -2,8 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::dtc;
-use super::names;
+use super::{dtc, monitors, names};
 use crate::{Field, Value};
 
 /// A parameter whose value is a line: `(raw * scale) + offset`.
@@ -25,7 +24,7 @@ const fn line(pid: u8, bytes: u8, name: &'static str, unit: &'static str, scale:
 }
 
 /// SAE J1979-DA, by the formulas that are public.
-const LINES: [Line; 64] = [
+const LINES: [Line; 68] = [
     line(0x04, 1, "calculated_load", "%", PERCENT, 0.0),
     line(0x05, 1, "coolant_temperature", "°C", 1.0, -40.0),
     line(0x06, 1, "short_term_fuel_trim_bank_1", "%", TRIM, -100.0),
@@ -82,6 +81,10 @@ const LINES: [Line; 64] = [
     line(0x62, 1, "actual_torque", "%", 1.0, -125.0),
     line(0x63, 2, "reference_torque", "Nm", 1.0, 0.0),
     line(0x8E, 1, "friction_torque", "%", 1.0, -125.0),
+    line(0x84, 1, "manifold_surface_temperature", "°C", 1.0, -40.0),
+    line(0x8D, 1, "absolute_throttle_position_g", "%", PERCENT, 0.0),
+    line(0x9E, 2, "exhaust_flow_rate", "kg/h", 0.2, 0.0),
+    line(0xA2, 2, "cylinder_fuel_rate", "mg/stroke", 1.0 / 32.0, 0.0),
     line(0xA6, 4, "odometer", "km", 0.1, 0.0),
     line(0x1C, 1, "obd_standard", "", 1.0, 0.0),
     line(0x51, 1, "fuel_type", "", 1.0, 0.0),
@@ -90,6 +93,140 @@ const LINES: [Line; 64] = [
     line(0x13, 1, "oxygen_sensors_present", "", 1.0, 0.0),
     line(0x1D, 1, "oxygen_sensors_present_4_banks", "", 1.0, 0.0),
     line(0x1E, 1, "auxiliary_input", "", 1.0, 0.0),
+];
+
+/// Parameters of several values, of which the first byte says which are there: the length, the name, and each value's bit, place,
+/// bytes, name, unit, scale and offset.
+struct Group {
+    pid: u8,
+    bytes: u8,
+    name: &'static str,
+    values: &'static [(u8, u8, u8, &'static str, &'static str, f64, f64)],
+}
+
+const GROUPS: [Group; 9] = [
+    Group {
+        pid: 0x66,
+        bytes: 5,
+        name: "air_flow_sensors",
+        values: &[
+            (0, 1, 2, "air_flow_a", "g/s", 1.0 / 32.0, 0.0),
+            (1, 3, 2, "air_flow_b", "g/s", 1.0 / 32.0, 0.0),
+        ],
+    },
+    Group {
+        pid: 0x67,
+        bytes: 3,
+        name: "coolant_temperatures",
+        values: &[
+            (0, 1, 1, "coolant_temperature_1", "°C", 1.0, -40.0),
+            (1, 2, 1, "coolant_temperature_2", "°C", 1.0, -40.0),
+        ],
+    },
+    Group {
+        pid: 0x6F,
+        bytes: 3,
+        name: "compressor_inlet_pressures",
+        values: &[
+            (0, 1, 1, "compressor_inlet_pressure_a", "kPa", 1.0, 0.0),
+            (1, 2, 1, "compressor_inlet_pressure_b", "kPa", 1.0, 0.0),
+        ],
+    },
+    Group { pid: 0x78, bytes: 9, name: "exhaust_gas_temperatures_bank_1", values: &EXHAUST_TEMPERATURES },
+    Group { pid: 0x79, bytes: 9, name: "exhaust_gas_temperatures_bank_2", values: &EXHAUST_TEMPERATURES },
+    Group {
+        pid: 0x7C,
+        bytes: 9,
+        name: "particulate_filter_temperatures",
+        values: &[
+            (0, 1, 2, "filter_inlet_temperature_bank_1", "°C", 0.1, -40.0),
+            (1, 3, 2, "filter_outlet_temperature_bank_1", "°C", 0.1, -40.0),
+            (2, 5, 2, "filter_inlet_temperature_bank_2", "°C", 0.1, -40.0),
+            (3, 7, 2, "filter_outlet_temperature_bank_2", "°C", 0.1, -40.0),
+        ],
+    },
+    Group {
+        pid: 0x87,
+        bytes: 5,
+        name: "intake_manifold_absolute_pressures",
+        values: &[
+            (0, 1, 2, "intake_manifold_absolute_pressure_a", "kPa", 1.0 / 32.0, 0.0),
+            (1, 3, 2, "intake_manifold_absolute_pressure_b", "kPa", 1.0 / 32.0, 0.0),
+        ],
+    },
+    Group {
+        pid: 0xA4,
+        bytes: 4,
+        name: "transmission_gear",
+        values: &[(1, 2, 2, "gear_ratio", "", 0.001, 0.0)],
+    },
+    Group {
+        pid: 0xA5,
+        bytes: 4,
+        name: "exhaust_fluid_dosing",
+        values: &[(0, 1, 1, "commanded_exhaust_fluid_dosing", "%", 0.5, 0.0)],
+    },
+];
+
+const EXHAUST_TEMPERATURES: [(u8, u8, u8, &str, &str, f64, f64); 4] = [
+    (0, 1, 2, "exhaust_gas_temperature_1", "°C", 0.1, -40.0),
+    (1, 3, 2, "exhaust_gas_temperature_2", "°C", 0.1, -40.0),
+    (2, 5, 2, "exhaust_gas_temperature_3", "°C", 0.1, -40.0),
+    (3, 7, 2, "exhaust_gas_temperature_4", "°C", 0.1, -40.0),
+];
+
+/// Parameters that are named and shown as bytes; each is the rest of its response.
+const NAMED: [(u8, &str); 40] = [
+    (0x65, "auxiliary_inputs_and_outputs"),
+    (0x68, "intake_air_temperature_sensors"),
+    (0x69, "egr_commanded_and_actual"),
+    (0x6A, "diesel_intake_air_flow_control"),
+    (0x6B, "egr_temperatures"),
+    (0x6C, "throttle_actuator_control"),
+    (0x6D, "fuel_pressure_control"),
+    (0x6E, "injection_pressure_control"),
+    (0x70, "boost_pressure_control"),
+    (0x71, "variable_geometry_turbo_control"),
+    (0x72, "wastegate_control"),
+    (0x73, "exhaust_pressures"),
+    (0x74, "turbocharger_speeds"),
+    (0x75, "turbocharger_a_temperatures"),
+    (0x76, "turbocharger_b_temperatures"),
+    (0x77, "charge_air_cooler_temperatures"),
+    (0x7A, "particulate_filter_bank_1"),
+    (0x7B, "particulate_filter_bank_2"),
+    (0x7D, "nox_control_area_status"),
+    (0x7E, "pm_control_area_status"),
+    (0x7F, "engine_run_times"),
+    (0x81, "run_times_of_auxiliary_device_1_to_5"),
+    (0x82, "run_times_of_auxiliary_device_6_to_10"),
+    (0x83, "nox_sensors"),
+    (0x85, "nox_reagent_system"),
+    (0x86, "pm_sensors"),
+    (0x88, "scr_induce_system"),
+    (0x89, "run_times_of_auxiliary_device_11_to_15"),
+    (0x8A, "run_times_of_auxiliary_device_16_to_20"),
+    (0x8B, "diesel_aftertreatment"),
+    (0x8C, "wide_range_oxygen_sensors"),
+    (0x8F, "pm_sensor_output"),
+    (0x90, "wwh_obd_vehicle_information"),
+    (0x91, "wwh_obd_ecu_information"),
+    (0x93, "wwh_obd_counters"),
+    (0x94, "nox_warning_and_inducement"),
+    (0x98, "exhaust_gas_temperature_sensors_bank_1"),
+    (0x99, "exhaust_gas_temperature_sensors_bank_2"),
+    (0x9A, "hybrid_vehicle_battery"),
+    (0x9B, "exhaust_fluid_sensor"),
+];
+
+/// Fuel system status (parameter 03), one bit each.
+const FUEL_SYSTEM: [(u8, &str); 6] = [
+    (0x00, "not there"),
+    (0x01, "open loop, not warm enough"),
+    (0x02, "closed loop"),
+    (0x04, "open loop by load or deceleration"),
+    (0x08, "open loop by a failure"),
+    (0x10, "closed loop with a fault"),
 ];
 
 const FUELS: [&str; 24] = [
@@ -146,18 +283,26 @@ fn length(pid: u8) -> Option<usize> {
         return Some(4);
     }
     let known = LINES.iter().find(|line| line.pid == pid).map(|line| usize::from(line.bytes));
+    let known = known.or_else(|| group(pid).map(|group| usize::from(group.bytes)));
     known.or(match pid {
-        0x01 | 0x24..=0x2B | 0x34..=0x3B | 0x41 | 0x4F | 0x50 => Some(4),
+        0x01 | 0x24..=0x2B | 0x34..=0x3B | 0x41 | 0x4F | 0x50 | 0x9D => Some(4),
         0x02 | 0x03 | 0x14..=0x1B | 0x55..=0x58 => Some(2),
         0x64 => Some(5),
         _ => None,
     })
 }
 
+fn group(pid: u8) -> Option<&'static Group> {
+    GROUPS.iter().find(|group| group.pid == pid)
+}
+
 /// What a parameter is called.
 pub fn name(pid: u8) -> Option<&'static str> {
     let known = LINES.iter().find(|line| line.pid == pid).map(|line| line.name);
+    let known = known.or_else(|| group(pid).map(|group| group.name));
+    let known = known.or_else(|| NAMED.iter().find(|(named, _)| *named == pid).map(|(_, name)| *name));
     known.or(match pid {
+        0x9D => Some("fuel_rates"),
         _ if pid.is_multiple_of(0x20) => Some("supported"),
         0x01 => Some("monitor_status"),
         0x02 => Some("freeze_frame_code"),
@@ -188,6 +333,17 @@ fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
         fields.push(Field::real(line.name, value * line.scale + line.offset, line.unit).meaning(text));
         return;
     }
+    if let Some(group) = group(pid) {
+        for &(bit, at, length, name, unit, scale, offset) in group.values {
+            let raw = number(&bytes[usize::from(at)..usize::from(at + length)]) as f64;
+            fields.push(if bytes[0] >> bit & 1 == 0 {
+                Field::missing(name)
+            } else {
+                Field::real(name, raw * scale + offset, unit)
+            });
+        }
+        return;
+    }
     let word = |at: usize| number(&bytes[at..at + 2]) as f64;
     let byte = |at: usize| f64::from(bytes[at]);
     match pid {
@@ -196,9 +352,20 @@ fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
             fields.push(Field::text("mil", if bytes[0] & 0x80 == 0 { "off" } else { "on" }));
             fields.push(Field::number("trouble_codes", bytes[0] & 0x7F));
             fields.push(Field::bytes("monitors", &bytes[1..]));
+            let open = monitors::not_complete(bytes);
+            fields.push(Field::text("not_complete", if open.is_empty() { "none".to_owned() } else { open }));
         }
         0x02 => fields.push(Field::text("freeze_frame_code", dtc::list(bytes))),
-        0x03 => fields.push(Field::bytes("fuel_system_status", bytes)),
+        0x03 => {
+            for (name, byte) in ["fuel_system_1", "fuel_system_2"].into_iter().zip(bytes) {
+                let text = FUEL_SYSTEM.iter().find(|(bit, _)| bit == byte).map(|(_, text)| *text);
+                fields.push(Field::hex(name, *byte, 2).meaning(text));
+            }
+        }
+        0x9D => {
+            fields.push(Field::real("engine_fuel_rate", word(0) / 50.0, "g/s"));
+            fields.push(Field::real("vehicle_fuel_rate", word(2) / 50.0, "g/s"));
+        }
         0x14..=0x1B => {
             fields.push(Field::real("oxygen_sensor_voltage", byte(0) / 200.0, "V"));
             if bytes[1] != 0xFF {
@@ -241,7 +408,7 @@ fn values(pid: u8, bytes: &[u8], fields: &mut Vec<Field>) {
 }
 
 /// The numbers whose bits are set.
-fn supported(first: u8, bytes: &[u8]) -> String {
+pub fn supported(first: u8, bytes: &[u8]) -> String {
     let bits = number(bytes);
     let mut text = String::new();
     for bit in 0..32_u8 {
@@ -263,6 +430,19 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
                 fields.push(Field::hex("pid", pid, 2).meaning(name(pid)));
             }
         }
+        6 => {
+            for mid in rest {
+                fields.push(Field::hex("mid", *mid, 2).meaning(monitors::name(*mid)));
+            }
+        }
+        8 => {
+            if let Some((&tid, data)) = rest.split_first() {
+                fields.push(Field::hex("tid", tid, 2).meaning(test_name(tid)));
+                if !data.is_empty() {
+                    fields.push(Field::bytes("parameters", data));
+                }
+            }
+        }
         9 => {
             for pid in rest {
                 fields.push(Field::hex("pid", *pid, 2).meaning(info_name(*pid)));
@@ -270,6 +450,15 @@ pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {
         }
         _ if !rest.is_empty() => fields.push(Field::bytes("parameters", rest)),
         _ => {}
+    }
+}
+
+/// Tests and actions of service 08.
+fn test_name(tid: u8) -> Option<&'static str> {
+    match tid {
+        _ if tid.is_multiple_of(0x20) => Some("supported"),
+        0x01 => Some("evaporative system leak test"),
+        _ => None,
     }
 }
 
@@ -316,6 +505,18 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
                 fields.push(Field::text("codes", dtc::list(codes)));
             }
         }
+        6 => monitors::results(rest, fields),
+        8 => {
+            let Some((&tid, after)) = rest.split_first() else { return };
+            fields.push(Field::hex("tid", tid, 2).meaning(test_name(tid)));
+            match after {
+                [_, _, _, _] if tid.is_multiple_of(0x20) => {
+                    fields.push(Field::text("supported", supported(tid, after)));
+                }
+                [] => {}
+                _ => fields.push(Field::bytes("value", after)),
+            }
+        }
         9 => {
             let Some((&pid, after)) = rest.split_first() else { return };
             fields.push(Field::hex("pid", pid, 2).meaning(info_name(pid)));
@@ -330,13 +531,28 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
                 0x0A => "ecu_name",
                 _ => "value",
             };
+            // Each of several has the same length.
+            let each = match pid {
+                0x04 => 16,
+                0x06 => 4,
+                0x08 | 0x0B => 2,
+                _ => items.len(),
+            };
+            if matches!(pid, 0x04 | 0x06 | 0x08 | 0x0B)
+                && count > 0
+                && items.len() == each * usize::from(count)
+            {
+                for item in items.chunks_exact(each) {
+                    fields.push(match pid {
+                        0x04 => Field::text("calibration", letters(item)),
+                        0x06 => Field::hex("verification_number", number(item), 8),
+                        _ => Field::number("count", number(item) as i64),
+                    });
+                }
+                return;
+            }
             if text && count > 0 {
-                let shown: String = items
-                    .iter()
-                    .filter(|byte| byte.is_ascii_graphic() || **byte == b' ')
-                    .map(|byte| char::from(*byte))
-                    .collect();
-                fields.push(Field::text(name, shown.trim().to_owned()));
+                fields.push(Field::text(name, letters(items)));
             } else {
                 fields.push(Field::number("items", count));
                 fields.push(Field::bytes("value", items));
@@ -345,6 +561,13 @@ pub fn response(sid: u8, mut rest: &[u8], fields: &mut Vec<Field>) {
         4 => {}
         _ => fields.push(Field::bytes("value", rest)),
     }
+}
+
+/// What is printed of the bytes.
+fn letters(bytes: &[u8]) -> String {
+    let shown = bytes.iter().filter(|byte| byte.is_ascii_graphic() || **byte == b' ');
+    let shown: String = shown.map(|byte| char::from(*byte)).collect();
+    shown.trim().to_owned()
 }
 
 /// The service's name for people: `current data`.
@@ -389,7 +612,24 @@ mod tests {
             (&[0x00, 0x80, 0, 0, 1], "pid 0x00 (supported), supported \"01 20\""),
             (
                 &[0x01, 0x82, 1, 2, 3],
-                "pid 0x01 (monitor_status), mil \"on\", trouble_codes 2, monitors 01 02 03",
+                "pid 0x01 (monitor_status), mil \"on\", trouble_codes 2, monitors 01 02 03, not_complete \"heated catalyst\"",
+            ),
+            (
+                &[0x66, 1, 1, 0, 2, 0],
+                "pid 0x66 (air_flow_sensors), air_flow_a 8 g/s, air_flow_b not available",
+            ),
+            (
+                &[0xA4, 2, 0, 0x13, 0x88, 0x9E, 0, 5],
+                "pid 0xA4 (transmission_gear), gear_ratio 5, pid 0x9E (exhaust_flow_rate), exhaust_flow_rate 1 kg/h",
+            ),
+            (
+                &[0x9D, 1, 0, 2, 0],
+                "pid 0x9D (fuel_rates), engine_fuel_rate 5.12 g/s, vehicle_fuel_rate 10.24 g/s",
+            ),
+            (&[0x83, 1, 2, 3], "pid 0x83 (nox_sensors), value 01 02 03"),
+            (
+                &[0x03, 2, 0],
+                "pid 0x03 (fuel_system_status), fuel_system_1 0x02 (closed loop), fuel_system_2 0x00 (not there)",
             ),
             (&[0xF0, 1], "pid 0xF0, value 01"),
             (&[0x0C, 1], "pid 0x0C (engine_speed), value 01"),
@@ -401,14 +641,30 @@ mod tests {
             "pid 0x0D (vehicle_speed), vehicle_speed 16 km/h, pid 0x05 (coolant_temperature), coolant_temperature 0 °C"
         );
         assert_eq!(said(3, &[2, 1, 0x33, 0x41, 0x55]), "trouble_codes 2, codes \"P0133, C0155\"");
+        assert_eq!(
+            said(9, b"\x04\x02JMB*36761500\0\0\0\0JMB*36761501\0\0\0\0"),
+            "pid 0x04 (calibration identifications), calibration \"JMB*36761500\", calibration \"JMB*36761501\""
+        );
+        assert_eq!(
+            said(9, &[6, 1, 0x17, 0x91, 0xBC, 0x82]),
+            "pid 0x06 (calibration verification numbers), verification_number 0x1791BC82"
+        );
+        assert_eq!(
+            said(9, &[8, 2, 0, 5, 1, 0]),
+            "pid 0x08 (in-use performance, spark ignition), count 5, count 256"
+        );
+        assert_eq!(said(8, &[0, 0xC0, 0, 0, 0]), "tid 0x00 (supported), supported \"01 02\"");
         assert_eq!(said(9, b"\x02\x01WVWZZZ1KZAW000001"), "pid 0x02 (VIN), vin \"WVWZZZ1KZAW000001\"");
     }
 
     #[test]
     fn each_parameter_is_there_once() {
         let mut pids: Vec<_> = LINES.iter().map(|line| line.pid).collect();
+        pids.extend(GROUPS.iter().map(|group| group.pid));
+        pids.extend(NAMED.iter().map(|(pid, _)| *pid));
+        let all = pids.len();
         pids.sort_unstable();
         pids.dedup();
-        assert_eq!(pids.len(), LINES.len());
+        assert_eq!(pids.len(), all);
     }
 }

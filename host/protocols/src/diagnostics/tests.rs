@@ -118,3 +118,117 @@ fn any_bytes_are_taken() {
         }
     }
 }
+
+#[test]
+fn what_wanted_no_response_may_still_be_refused() {
+    assert_eq!(
+        said(&[(0.0, "7E0#023E80"), (1.0, "7E8#037F3E12")]),
+        [
+            "uds 7E0 > 7E8 TesterPresent: sid 0x3E, sub_function 0x00 (zero), response \"not wanted\"",
+            "uds 7E0 > 7E8 TesterPresent: sid 0x3E, sub_function 0x00 (zero), nrc 0x12 (subFunctionNotSupported), after 1 ms",
+        ]
+    );
+    // Once it is pending, the response comes.
+    let pending = said(&[(0.0, "7E0#021083"), (1.0, "7E8#037F1078"), (2.0, "7E8#065003003201F4")]);
+    assert_eq!(pending.len(), 2, "{pending:?}");
+    assert!(pending[1].contains("p2_ms 50") && pending[1].contains("pending 1 times"), "{pending:?}");
+    // It does not end what waits for its response meanwhile.
+    let between = said(&[
+        (0.0, "7E0#0431010203"),
+        (1.0, "7E8#037F3178"),
+        (2000.0, "7E0#023E80"),
+        (4000.0, "7E0#023E80"),
+        (5000.0, "7E8#057101020300"),
+    ]);
+    assert_eq!(between.len(), 3, "{between:?}");
+    assert!(between[2].contains("RoutineControl") && between[2].contains("status 00"), "{between:?}");
+    // KWP2000 says it otherwise.
+    assert_eq!(
+        said(&[(0.0, "7E0#021A90"), (1.0, "7E8#065A9041424344"), (2.0, "7E0#023E02"), (4000.0, "100#")])[1],
+        "kwp2000 7E0 > 7E8 testerPresent: sid 0x3E, parameters 02, response \"not wanted\""
+    );
+}
+
+/// Of several that are asked at once, each is said by itself.
+#[test]
+fn who_said_pending_and_fell_silent_is_named() {
+    let said = said(&[
+        (0.0, "7DF#0322F190"),
+        (1.0, "7E8#037F2278"),
+        (2.0, "7E8#037F2278"),
+        (3.0, "7E9#0562F1904142"),
+        (12_000.0, "100#"),
+    ]);
+    assert_eq!(
+        said,
+        [
+            "uds 7DF > 7E9 ReadDataByIdentifier: sid 0x22, did 0xF190 (VIN), value 41 42, asked \"all\", after 3 ms",
+            "uds 7DF > 7E8 ReadDataByIdentifier: sid 0x22, did 0xF190 (VIN), response \"none\", pending 2 times, asked \"all\"; \
+             nothing came for 10000 ms",
+        ]
+    );
+}
+
+/// An address of four and a size of eight bytes: the first byte of the two lengths is above 127.
+#[test]
+fn memory_has_addresses_and_sizes_of_any_length() {
+    for lengths in 0..=0xFF {
+        for length in [0, 1, 4, 8, 12, 16, 17] {
+            let mut fields = Vec::new();
+            uds::request(&[&[0x34, 0, lengths][..], &vec![0x11; length]].concat(), &mut fields);
+            assert!(fields.len() >= 2, "{lengths:02X} {length}");
+            let address = fields.iter().find(|field| field.name == "address");
+            if let (Some(field), 1..=8) = (address, lengths & 15) {
+                assert_eq!(field.to_string().len(), "address 0x".len() + 2 * usize::from(lengths & 15));
+            }
+        }
+    }
+}
+
+#[test]
+fn services_have_their_own_fields() {
+    for (frames, expected) in [
+        (["7E0#0422F1F186", ""], "did 0xF1F1, rest 86"),
+        (
+            ["7E0#03280301", "7E8#026803"],
+            "sub_function 0x03 (disable receiving and sending), communication_type 0x01 (normal), after",
+        ),
+        (
+            ["7E0#042A01F2F3", "7E8#016A"],
+            "mode 0x01 (slow), did 0xF2F2 (periodic), did 0xF2F3 (periodic), after",
+        ),
+        (["7E0#043101FF00", "7E8#057101FF0000"], "routine 0xFF00 (erase memory), status 00"),
+        (
+            ["7E0#028301", "7E8#02C301"],
+            "uds 7E0 > 7E8 AccessTimingParameter: sid 0x83, sub_function 0x01 (read extended timing)",
+        ),
+        (["", "7E8#056FF1900355"], "did 0xF190 (VIN), status 55"),
+    ] {
+        let frames = frames.iter().enumerate().filter(|(_, frame)| !frame.is_empty());
+        let frames: Vec<_> = frames.map(|(at, frame)| (at as f64, frame.replace(' ', ""))).collect();
+        let frames: Vec<_> = frames.iter().map(|(at, frame)| (*at, frame.as_str())).collect();
+        let said = said(&frames);
+        assert!(said[0].contains(expected), "{said:?}");
+    }
+}
+
+/// Bytes that chance sends through ISO 15765-2 rarely get as far as a service's own fields.
+#[test]
+fn requests_and_responses_of_any_bytes_are_taken() {
+    let seed = fastrand::u64(..);
+    eprintln!("seed {seed}");
+    let mut random = fastrand::Rng::with_seed(seed);
+    for round in 0..100_000_u32 {
+        let bytes: Vec<u8> = (0..random.usize(1..20)).map(|_| random.u8(..)).collect();
+        let (asked, answer) =
+            ([&[round as u8], &bytes[..]].concat(), [&[round as u8 | 0x40], &bytes[..]].concat());
+        let mut fields = Vec::new();
+        uds::request(&asked, &mut fields);
+        uds::response(random.bool().then_some(&asked), &answer, &mut fields);
+        uds::kwp_request(&asked, &mut fields);
+        uds::kwp_response(random.bool(), &answer, &mut fields);
+        obd::request(round as u8 & 15, &bytes, &mut fields);
+        obd::response(round as u8 & 15, &bytes, &mut fields);
+        assert!(fields.iter().all(|field| !field.to_string().is_empty()));
+    }
+}

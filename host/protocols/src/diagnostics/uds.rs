@@ -2,7 +2,7 @@
 
 use std::fmt::Write as _;
 
-use super::{dtc, names, obd};
+use super::{dtc, names, obd, reports};
 use crate::Field;
 
 /// The bit of a sub-function that suppresses the positive response.
@@ -67,7 +67,7 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
         }
         (0x31, [sub, high, low, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            fields.push(Field::hex("routine", u16::from_be_bytes([*high, *low]), 4));
+            fields.push(routine(*high, *low));
             rest("parameters", data, fields);
         }
         (0x14, [a, b, c, data @ ..]) => {
@@ -84,23 +84,40 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
             fields.push(Field::number("block", *block));
             fields.push(Field::number("length", data.len() as i64).unit("bytes"));
         }
-        (0x38, [operation, ..]) => {
+        (0x38, [operation, data @ ..]) => {
             fields.push(sub_function(sid, *operation));
-            rest("parameters", &after[1..], fields);
+            file(data, fields);
+        }
+        (0x28, [sub, kind, data @ ..]) => {
+            fields.push(sub_function(sid, *sub));
+            let text = ["", "normal", "network management", "normal and network management"];
+            let text = text.get(usize::from(kind & 3)).copied().filter(|text| !text.is_empty());
+            fields.push(Field::hex("communication_type", *kind, 2).meaning(text));
+            rest("parameters", data, fields);
+        }
+        (0x2A, [mode, data @ ..]) => {
+            let text = ["", "slow", "medium", "fast", "stop"];
+            let text = text.get(usize::from(*mode)).copied().filter(|text| !text.is_empty());
+            fields.push(Field::hex("mode", *mode, 2).meaning(text));
+            fields.extend(data.iter().map(|low| did(&[0xF2, *low])));
+        }
+        (0x2C, [sub, a, b, data @ ..]) => {
+            fields.push(sub_function(sid, *sub));
+            fields.push(did(&[*a, *b]));
+            if sub & !SUPPRESS == 1 && data.len() % 4 == 0 {
+                for source in data.chunks_exact(4) {
+                    let from = u16::from_be_bytes([source[0], source[1]]);
+                    fields.push(Field::hex("source", from, 4).meaning(names::data_identifier(from)));
+                    fields.push(Field::number("position", source[2]));
+                    fields.push(Field::number("size", source[3]).unit("bytes"));
+                }
+            } else {
+                rest("parameters", data, fields);
+            }
         }
         (0x19, [sub, data @ ..]) => {
             fields.push(sub_function(sid, *sub));
-            match (sub & !SUPPRESS, data) {
-                (0x01 | 0x02 | 0x0F | 0x11 | 0x12 | 0x13, [mask, ..]) => {
-                    fields.push(Field::hex("status_mask", *mask, 2));
-                }
-                (0x03 | 0x04 | 0x06 | 0x09 | 0x10, [a, b, c, data @ ..]) => {
-                    let name = format!("{}-{c:02X}", dtc::Dtc(u16::from_be_bytes([*a, *b])));
-                    fields.push(Field::text("code", name));
-                    rest("record", data, fields);
-                }
-                _ => rest("parameters", data, fields),
-            }
+            reports::request(sub & !SUPPRESS, data, fields);
         }
         (_, [sub, data @ ..]) if names::has_sub_function(sid) => {
             fields.push(sub_function(sid, *sub));
@@ -110,15 +127,42 @@ pub fn request(bytes: &[u8], fields: &mut Vec<Field>) {
     }
 }
 
+/// Routines that ISO 14229-1:2020 gives a meaning (table F.1).
+fn routine(high: u8, low: u8) -> Field {
+    let routine = u16::from_be_bytes([high, low]);
+    let text = match routine {
+        0xE200 => Some("deploy loop"),
+        0xFF00 => Some("erase memory"),
+        0xFF01 => Some("check programming dependencies"),
+        0xFF02 => Some("erase mirror memory trouble codes"),
+        _ => None,
+    };
+    Field::hex("routine", routine, 4).meaning(text)
+}
+
+/// A file's name behind its length of two bytes, and what follows it (ISO 14229-1:2020, 14.6).
+fn file(data: &[u8], fields: &mut Vec<Field>) {
+    let named = data
+        .split_first_chunk::<2>()
+        .and_then(|(length, left)| left.split_at_checked(usize::from(u16::from_be_bytes(*length))));
+    let Some((name, left)) = named else {
+        rest("parameters", data, fields);
+        return;
+    };
+    fields.push(Field::text("file", String::from_utf8_lossy(name).into_owned()));
+    rest("parameters", left, fields);
+}
+
 /// Address and size behind a byte with their lengths (ISO 14229-1:2020, H.1).
 fn memory(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
     let (address, size) = (usize::from(lengths & 15), usize::from(lengths >> 4));
     let number = |bytes: &[u8]| bytes.iter().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
     if address == 0 || address > 8 || size > 8 || data.len() < address + size {
+        fields.push(Field::hex("lengths", lengths, 2));
         rest("parameters", data, fields);
         return;
     }
-    fields.push(Field::hex("address", number(&data[..address]), (2 * lengths) & 15));
+    fields.push(Field::hex("address", number(&data[..address]), 2 * address as u8));
     fields.push(Field::number("size", number(&data[address..address + size]) as i64).unit("bytes"));
     rest("parameters", &data[address + size..], fields);
 }
@@ -155,23 +199,7 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             if !heard {
                 fields.push(sub_function(sid, *sub));
             }
-            match (sub, data) {
-                (0x01 | 0x07 | 0x11 | 0x12, [mask, format, high, low]) => {
-                    fields.push(Field::hex("available_mask", *mask, 2));
-                    fields.push(Field::hex("format", *format, 2));
-                    fields.push(Field::number("trouble_codes", u16::from_be_bytes([*high, *low])));
-                }
-                (0x02 | 0x0A..=0x0F | 0x13 | 0x15, [mask, codes @ ..]) if codes.len() % 4 == 0 => {
-                    fields.push(Field::hex("available_mask", *mask, 2));
-                    fields.push(Field::number("trouble_codes", (codes.len() / 4) as i64));
-                    fields.push(Field::text("codes", dtc::list_with_status(codes)));
-                }
-                (0x04 | 0x06 | 0x10, [a, b, c, status, data @ ..]) => {
-                    fields.push(Field::text("codes", dtc::list_with_status(&[*a, *b, *c, *status])));
-                    rest("record", data, fields);
-                }
-                _ => rest("value", data, fields),
-            }
+            reports::response(*sub, data, fields);
         }
         (0x27, [sub, data @ ..]) => {
             if !heard {
@@ -180,11 +208,18 @@ pub fn response(request: Option<&[u8]>, bytes: &[u8], fields: &mut Vec<Field>) {
             rest("seed", data, fields);
         }
         (0x2E, [_, _]) if !heard => fields.push(did(after)),
-        (0x2F, [_, _, _, data @ ..]) => rest("status", data, fields),
+        (0x2F, [_, _, _, data @ ..]) => {
+            if !heard {
+                fields.push(did(after));
+            }
+            rest("status", data, fields);
+        }
+        // What the request said already.
+        (0x28, [_]) | (0x2C, [_, _, _]) if heard => {}
         (0x31, [sub, high, low, data @ ..]) => {
             if !heard {
                 fields.push(sub_function(sid, *sub));
-                fields.push(Field::hex("routine", u16::from_be_bytes([*high, *low]), 4));
+                fields.push(routine(*high, *low));
             }
             rest("status", data, fields);
         }

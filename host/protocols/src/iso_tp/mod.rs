@@ -43,6 +43,8 @@ struct Open {
     next: u8,
     /// Its pair was found by this very transfer.
     is_new: bool,
+    /// Bytes of the first frame with its address and control information: those that follow are as long, but for the last one.
+    frame_bytes: usize,
     /// When the last consecutive frame came; frames of one block have a least distance.
     last_ns: Option<i64>,
 }
@@ -94,7 +96,9 @@ impl Transport {
             let Some((pair, transfer)) = found else { return };
             if self.pairs.add(channel, pair) {
                 let offset = usize::from(pair.a.address.is_some());
-                self.begin(Open { transfer, next: 1, is_new: true, last_ns: None }, out);
+                // Of a transfer that was just found, the first frame is not at hand any more.
+                let frame_bytes = first_frame_bytes(&transfer, offset);
+                self.begin(Open { transfer, next: 1, is_new: true, frame_bytes, last_ns: None }, out);
                 self.frame(record, offset, bytes, out);
             }
             return;
@@ -196,9 +200,12 @@ impl Transport {
             Pci::First { length, data } => {
                 self.overlap(key, out);
                 let transfer = Transfer { data: data.to_vec(), length, ..fresh };
-                self.begin(Open { transfer, next: 1, is_new: false, last_ns: None }, out);
+                let frame_bytes = bytes.len();
+                self.begin(Open { transfer, next: 1, is_new: false, frame_bytes, last_ns: None }, out);
             }
-            Pci::Consecutive { number, data } => self.consecutive(key, number, data, &fresh, out),
+            Pci::Consecutive { number, data } => {
+                self.consecutive(key, number, data, bytes.len(), &fresh, out);
+            }
             Pci::Flow { status, block_size, separation_us } => {
                 let Some(of) = to else { return };
                 let Some(open) = self.open.get_mut(&(channel, of)) else { return };
@@ -241,6 +248,7 @@ impl Transport {
         key: (u8, Endpoint),
         number: u8,
         data: &[u8],
+        frame_bytes: usize,
         fresh: &Transfer,
         out: &mut impl FnMut(Transfer),
     ) {
@@ -275,6 +283,13 @@ impl Transport {
         }
         open.next = (number + 1) & 15;
         let missing = (transfer.length as usize).saturating_sub(transfer.data.len());
+        if data.len() < missing && frame_bytes < open.frame_bytes {
+            if let Some(open) = self.open.remove(&key) {
+                self.headless.insert(key, number);
+                end(open, Trouble::Malformed("a frame in the middle is shorter than the first one"), out);
+            }
+            return;
+        }
         let room = MOST_BYTES.saturating_sub(transfer.data.len());
         transfer.data.extend_from_slice(&data[..data.len().min(missing).min(room)]);
         let all = transfer.data.len() == transfer.length as usize;
@@ -289,6 +304,12 @@ impl Transport {
             }
         }
     }
+}
+
+/// How long the first frame was, by what it brought of the message. The control information has two bytes; only what is longer than
+/// 4095 bytes has more, and is not looked for.
+fn first_frame_bytes(transfer: &Transfer, offset: usize) -> usize {
+    offset + 2 + transfer.data.len()
 }
 
 /// Hands out what did not become whole.

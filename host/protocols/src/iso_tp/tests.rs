@@ -227,3 +227,26 @@ fn transfers_at_random_are_whole_and_right_or_said_to_be_broken() {
         }
     }
 }
+
+/// Its bytes would end up in the wrong places.
+#[test]
+fn a_short_frame_in_the_middle_is_not_glued_over() {
+    let frames =
+        ["7E8#1014620F19057565", "7E0#300000", "7E8#21575A5A", "7E8#225A314B5A415730", "7E8#2330303031"];
+    let records: Vec<_> = frames.iter().enumerate().map(|(ms, frame)| at(ms as f64, frame)).collect();
+    let all = transfers(&[], &records);
+    assert_eq!(all.len(), 1, "{all:?}");
+    assert!(matches!(all[0].trouble, Some(Trouble::Malformed(_))), "{all:?}");
+    // In CAN FD, the last one alone may be shorter, and the first one says how long the others are.
+    let fd = |ms: i64, bytes: Vec<u8>| {
+        let frame = FdFrame::new(Id::standard_truncated(0x7E8), true, false, &bytes).unwrap();
+        let event = TraceEvent::Frame { frame: frame.into(), direction: Direction::Rx, late: false };
+        TraceRecord { time_ns: ms * 1_000_000, channel: 1, event }
+    };
+    let first = [&[0x10, 100][..], &[1; 62]].concat();
+    let whole = transfers(&[], &[fd(0, first.clone()), fd(1, [&[0x21][..], &[2; 47]].concat())]);
+    assert!(whole[0].is_whole(), "{whole:?}");
+    let short =
+        transfers(&[], &[fd(0, first), fd(1, [&[0x21][..], &[2; 7]].concat()), fd(2, vec![0x22; 48])]);
+    assert!(matches!(short[0].trouble, Some(Trouble::Malformed(_))), "{short:?}");
+}

@@ -24,7 +24,7 @@ fn a_broadcast_of_trouble_codes_is_one_message() {
         [
             "j1939 0 > all DM1 active trouble codes: pgn 65226, priority 7, transport \"BAM\", length 10 bytes, \
           malfunction_lamp \"off\", red_stop_lamp \"off\", amber_warning_lamp \"on\", protect_lamp \"off\", trouble_codes 2, \
-          codes \"SPN 2750 FMI 3 (voltage above normal or shorted high) 2 times in an old conversion, whose number may be another, \
+          codes \"SPN 2750 FMI 3 (voltage above normal or shorted high) 2 times in an old conversion: SPN 389200 by version 1, 22000 by version 2, \
           SPN 7969 FMI 3 (voltage above normal or shorted high)\", spn 2750, fmi 3, occurrences 2, spn 7969, fmi 3"
         ]
     );
@@ -219,4 +219,43 @@ fn any_frames_are_taken() {
     let gap = cantap_trace::TraceRecord { time_ns: 0, channel: 1, event: TraceEvent::GAP };
     assembler.take(&gap, &mut events);
     assembler.finish(&mut events);
+}
+
+/// The receiver asks again for what it missed, although it was heard here.
+#[test]
+fn frames_that_come_again_behind_the_last_one_are_no_fault() {
+    let frames = [
+        (0.0, "18EC2100#100E0002FFEBFE00"),
+        (1.0, "18EC0021#110201FFFFEBFE00"),
+        (2.0, "18EB2100#0141424344454647"),
+        (3.0, "18EB2100#0248494A4B4C4D4E"),
+        (4.0, "18EC0021#110101FFFFEBFE00"),
+        (5.0, "18EB2100#0141424344454647"),
+        (6.0, "18EC0021#130E0002FFEBFE00"),
+    ];
+    let all = said(&frames);
+    assert_eq!(all.len(), 1, "{all:?}");
+    assert!(all[0].contains("text \"ABCDEFGHIJKLMN\""), "{all:?}");
+    // What comes long after belongs to nothing.
+    let late = said(&[frames[0], frames[1], frames[2], frames[3], (9000.0, frames[5].1)]);
+    assert!(late[1].ends_with("its beginning was not heard"), "{late:?}");
+}
+
+/// Two nodes send to each other at once; one of them gives up.
+#[test]
+fn an_abort_ends_the_message_that_it_names() {
+    let all = said(&[
+        (0.0, "18EC2100#100E0002FFEBFE00"),
+        (1.0, "18EC0021#100E0002FFDAFE00"),
+        (2.0, "18EC0021#FF09FFFFFFDAFE00"),
+        (3.0, "18EC0021#110201FFFFEBFE00"),
+        (4.0, "18EB2100#0141424344454647"),
+        (5.0, "18EB2100#0248494A4B4C4D4E"),
+    ]);
+    assert_eq!(all.len(), 2, "{all:?}");
+    assert!(
+        all[0].contains("pgn 65242") && all[0].ends_with("aborted: too long for the receiver"),
+        "{all:?}"
+    );
+    assert!(all[1].contains("pgn 65259") && all[1].contains("text \"ABCDEFGHIJKLMN\""), "{all:?}");
 }

@@ -83,6 +83,8 @@ pub struct LongMessages {
     open: FxHashMap<(u8, u8, u8, bool), Open>,
     /// Messages that ended early, or whose beginning was not heard: the last frame of each, so that its rest is reported once.
     headless: FxHashMap<(u8, u8, u8, bool), u8>,
+    /// Connections whose last frame was heard and that the receiver has not acknowledged: it may ask for frames again that we have.
+    delivered: FxHashMap<(u8, u8, u8, bool), i64>,
     sweep_ns: i64,
 }
 
@@ -98,6 +100,12 @@ fn reason(code: u8) -> &'static str {
         7 => "bad sequence number",
         8 => "sequence number twice",
         9 => "too long for the receiver",
+        10 => "unexpected offset of an extended transfer",
+        11 => "offset of another parameter group",
+        12 => "more frames in an offset than were cleared",
+        13 => "bad offset of an extended transfer",
+        15 => "clear to send of another parameter group",
+        16 => "more was asked for than the message has",
         250 => "another reason",
         _ => "unknown reason",
     }
@@ -147,6 +155,7 @@ impl LongMessages {
 
     fn begin(&mut self, key: (u8, u8, u8, bool), open: Open, out: &mut impl FnMut(Assembled)) {
         self.headless.remove(&key);
+        self.delivered.remove(&key);
         if let Some(before) = self.open.remove(&key) {
             end(before, Trouble::Overlapped, out);
         }
@@ -231,6 +240,7 @@ impl LongMessages {
                 open.message.time_ns = time_ns;
             }
             (19 | 23, _) => {
+                self.delivered.remove(&back);
                 // All that had arrived was handed out with its last frame; what is still here was not heard whole.
                 if let Some(mut open) = self.open.remove(&back) {
                     open.message.time_ns = time_ns;
@@ -241,7 +251,11 @@ impl LongMessages {
             }
             (255, _) => {
                 let forward = (channel, source, destination, extended);
-                let found = self.open.remove(&back).or_else(|| self.open.remove(&forward));
+                // Both may send to each other at the same time: the group says which message is meant.
+                let means = |key| self.open.get(key).is_some_and(|open| open.message.header.pgn == of.pgn);
+                let key = if means(&forward) && !means(&back) { forward } else { back };
+                self.delivered.remove(&back);
+                let found = self.open.remove(&key).or_else(|| self.open.remove(&forward));
                 if let Some(mut open) = found {
                     open.message.time_ns = time_ns;
                     open.message.frames += 1;
@@ -267,6 +281,15 @@ impl LongMessages {
         let key = (channel, header.source, header.destination, header.pgn == EXTENDED_DATA);
         let Some((&sequence, bytes)) = data.split_first() else { return true };
         let Some(open) = self.open.get_mut(&key) else {
+            // Sent again for a receiver that missed what was heard here.
+            if let Some(last_ns) = self.delivered.get_mut(&key) {
+                let age_ns = time_ns.saturating_sub(*last_ns);
+                *last_ns = time_ns;
+                if age_ns <= PEER_NS {
+                    return true;
+                }
+                self.delivered.remove(&key);
+            }
             if self.headless.len() >= MOST_OPEN {
                 self.headless.clear();
             }
@@ -298,6 +321,12 @@ impl LongMessages {
             && let Some(open) = self.open.remove(&key)
         {
             if open.message.data.len() == size {
+                if open.message.way != Way::Broadcast {
+                    if self.delivered.len() >= MOST_OPEN {
+                        self.delivered.clear();
+                    }
+                    self.delivered.insert(key, time_ns);
+                }
                 out(open.message);
             } else if size > MOST_BYTES {
                 end(open, Trouble::Cut, out);

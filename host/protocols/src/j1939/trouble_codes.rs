@@ -7,7 +7,7 @@ use crate::Field;
 
 /// Whether the group carries lamps and codes as DM1 does.
 pub const fn carries(pgn: u32) -> bool {
-    matches!(pgn, 0xFECA | 0xFECB | 0xFECF | 0xFED4)
+    matches!(pgn, 0xFECA | 0xFECB | 0xFECF | 0xFED4 | 0xFDB5 | 0xFD80 | 0xFD82)
 }
 
 /// Lamps, then codes.
@@ -38,7 +38,10 @@ pub fn fields(data: &[u8], fields: &mut Vec<Field>) {
             let _ = write!(text, " {times} times");
         }
         if code[3] & 0x80 != 0 {
-            text.push_str(" in an old conversion, whose number may be another");
+            // The first two of the four ways to write a number are not told from the third by anything in the message.
+            let [a, b, c] = [code[0], code[1], code[2] >> 5].map(u32::from);
+            let (first, second) = (a << 11 | b << 3 | c, b << 11 | a << 3 | c);
+            let _ = write!(text, " in an old conversion: SPN {first} by version 1, {second} by version 2");
         }
         each.push(Field::number("spn", spn));
         each.push(Field::number("fmi", fmi));

@@ -21,7 +21,7 @@ end_bridge() {
 listen() {
   LISTENERS=
   for _interface in "$@"; do
-    candump -L -r 8000000 "$_interface,0:0,#FFFFFFFF" > "$_interface.txt" &
+    candump -d -L -r 8000000 "$_interface,0:0,#FFFFFFFF" > "$_interface.txt" &
     LISTENERS="$LISTENERS $!"
   done
   sleep 0.5
@@ -44,7 +44,9 @@ heard() {
   wait $LISTENERS 2> /dev/null
 }
 # frames FILE: a candump log's frames, without errors, and without a DLC above 8, which not every version of candump prints.
-frames() { awk '{ print $3 }' "$1" | grep -v '^2[0-9A-F]\{7\}#' | bare; }
+frames() { grep -v DROPCOUNT "$1" | awk '{ print $3 }' | grep -v '^2[0-9A-F]\{7\}#' | bare; }
+# dropped FILE: what its socket lost, as candump says.
+dropped() { sed -n 's/^DROPCOUNT: .*(total drops \([0-9]*\)).*/\1/p' "$1" | tail -n 1 | grep . || echo 0; }
 bare() { sed 's/#R.*$/#R/; s/_[0-9A-F]$//'; }
 errors() { awk '{ print $3 }' "$1" | grep -c '^2[0-9A-F]\{7\}#'; }
 
@@ -57,25 +59,43 @@ for _bus in bus0 bus1; do
   iproute2 link add $_bus type vcan && ip link set $_bus up
 done
 
-for _job in "50 mix" "100 mix" "100 std0"; do
+# The bridge is ended before candump: what was captured is all handed on by then, however far behind the guest is. What is missing must be
+# counted, by the bridge or by candump, whose socket may overflow.
+crossed() { [ "$(both taken)" = "$_frames $_frames" ]; }
+grown() { wc -c bus0.txt bus1.txt | tail -n 1; }
+for _job in "100 mix 4000" "100 std0 20000"; do
   board traffic 0 mix
   bridge bus0 bus1
   listen bus0 bus1
   board mark
-  # shellcheck disable=SC2086 # words
-  board play 1 $_job 4000
-  # shellcheck disable=SC2086
-  board play 2 $_job 4000
-  heard
-  board dump bridge
-  _bad=0
+  _frames=${_job##* }
   for _n in 1 2; do
-    frames bus$((_n - 1)).txt > got$_n
-    bare < /share/bridge.taken$_n | cmp -s - got$_n || _bad=1
-    [ "$(wc -l < got$_n)" = 4000 ] || _bad=1
+    # shellcheck disable=SC2086 # words
+    board play $_n $_job
   done
-  verdict $_bad "bridge, candump: $_job" "$(wc -l < got1) + $(wc -l < got2) frames in order"
+  for _ in 1 2 3 4 5 6; do wait_until crossed && break; done
+  board dump bridge
   check "bridge: ends with Ctrl-C" end_bridge
+  _before=none
+  while _now=$(grown) && [ "$_before" != "$_now" ]; do
+    _before=$_now
+    sleep 0.5
+  done
+  heard
+  for _n in 1 2; do
+    _bus=bus$((_n - 1))
+    frames $_bus.txt > got$_n
+    _got=$(wc -l < got$_n)
+    # shellcheck disable=SC2046 # three words
+    set -- $(sed -n "s/^.*$_bus: \([0-9]*\) frames heard, \([0-9]*\) lost before that, \([0-9]*\) not taken.*/\1 \2 \3/p" bridge.err)
+    _dropped=$(dropped $_bus.txt)
+    [ "$(($1 + $2 + $3))" = "$_frames" ] && [ "$((_got + _dropped))" = "$1" ] && [ "$_got" -gt 3000 ]
+    verdict $? "bridge, candump: $_job, all accounted for on channel $_n" "$1 heard, $2 lost, $3 not taken; $_got, $_dropped dropped by candump"
+    if [ "$_got" = "$_frames" ]; then
+      bare < /share/bridge.taken$_n | cmp -s - got$_n
+      verdict $? "bridge, candump: $_job, in order on channel $_n"
+    fi
+  done
 done
 
 # Who only listens sends nothing, and is told so.

@@ -54,5 +54,32 @@ iproute2 -details -statistics link show can0
 ip link set can0 down
 killall ldattach
 sleep 1
+
+# slcand sends no `K1`; what was saved counts.
+board traffic 0 mix
+saves() {
+  stty -F "$PORT" raw -echo && (
+    printf '%b' "$1"
+    sleep 2
+  ) > "$PORT"
+}
+slcand_has_errors() {
+  slcand -o -s8 -S 3000000 "${PORT#/dev/}" slcan0
+  wait_until has_interface slcan0 && ip link set slcan0 up
+  sleep 0.5
+  board noise 30
+  board play 1 50 mix 300
+  settled
+  board noise 0
+  _errors=$(cat /sys/class/net/slcan0/statistics/rx_errors)
+  killall slcand
+  sleep 1
+  [ "$_errors" -gt 0 ]
+}
+saves 'K1\rQ1\r'
+check "slcan's reports: slcand has them when K1 was saved" slcand_has_errors
+saves 'Q0\r'
+has_no_errors() { ! slcand_has_errors; }
+check "slcan's reports: and none when it was not" has_no_errors
 board traffic 50 mix
 capture_is_exact "a capture after slcan's reports"

@@ -1,0 +1,69 @@
+//! The interrupts that stamp.
+
+use stm32f4xx_hal::pac::can1::RegisterBlock;
+use stm32f4xx_hal::pac::{CAN1, CAN2};
+
+/// Bits of IER: transmit mailbox empty, FIFO 0 message pending (RM0090, CAN_IER).
+pub(super) const TMEIE: usize = 0;
+const FMPIE0: usize = 1;
+
+/// The switches of a controller's receive and transmit interrupts: `CAN` is 0 or 1. Each interrupt only stamps, silences itself and leaves
+/// the rest to a task of lower priority, which switches it on again.
+///
+/// Both tasks and both interrupts share these. The switches are bits of one register, each changed through its bit-band alias (Cortex-M4
+/// technical reference manual, "Bit-banding"), one at a time and untorn: an interrupt between reading and writing the whole register
+/// would be undone. Commands write the register only while the controller is off the bus.
+///
+/// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it interrupt.
+pub struct Bells<const CAN: usize>(());
+
+#[expect(clippy::unused_self, reason = "only whoever holds the bells may ring them")]
+impl<const CAN: usize> Bells<CAN> {
+    /// For `Controllers::new` alone.
+    pub(super) const fn new() -> Self {
+        Self(())
+    }
+
+    #[inline]
+    fn registers() -> &'static RegisterBlock {
+        let block = if CAN == 0 { CAN1::ptr() } else { CAN2::ptr() };
+        // SAFETY: the registers are there for the whole program, and `Controllers::new`, which makes the only bells, took them.
+        unsafe { &*block }
+    }
+
+    /// Silenced bells are read back, so that the line has fallen before the interrupt returns.
+    #[inline]
+    fn silence(bit: usize) {
+        switch(Self::registers(), bit, false);
+        Self::registers().ier().read();
+    }
+
+    /// Ends the receive interrupt though frames are waiting.
+    #[inline]
+    pub fn silence_receive(&self) {
+        Self::silence(FMPIE0);
+    }
+
+    /// Interrupts again on a frame: at once if one is waiting.
+    #[inline]
+    pub fn open_receive(&self) {
+        switch(Self::registers(), FMPIE0, true);
+    }
+
+    /// Ends the transmit interrupt though a mailbox has finished, until [`Traffic::await_finished`].
+    #[inline]
+    pub fn silence_transmit(&self) {
+        Self::silence(TMEIE);
+    }
+}
+
+/// Switches an interrupt of a controller through its bit's alias (see [`Bells`]).
+#[inline]
+pub(super) fn switch(controller: &RegisterBlock, bit: usize, on: bool) {
+    const PERIPHERALS: usize = 0x4000_0000;
+    const ALIAS: usize = 0x4200_0000;
+    let register = controller.ier().as_ptr() as usize;
+    let alias = (ALIAS + (register - PERIPHERALS) * 32 + bit * 4) as *mut u32;
+    // SAFETY: the controllers lie in the first megabyte of the peripherals, so the word is IER's bit.
+    unsafe { alias.write_volatile(u32::from(on)) };
+}

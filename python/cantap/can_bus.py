@@ -156,7 +156,8 @@ class CantapBus(can.BusABC):
 
     def recv(self, timeout: float | None = None) -> can.Message | None:
         """As python-can's, which looks at each message again: here filters are done."""
-        message = self._next(timeout)
+        # By the method that classes derived from this one may have of their own.
+        message, _ = self._recv_internal(timeout)
         if message is not None and LOG.isEnabledFor(self.RECV_LOGGING_LEVEL):
             LOG.log(self.RECV_LOGGING_LEVEL, "Received: %s", message)
         return message

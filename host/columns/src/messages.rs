@@ -3,11 +3,9 @@
 use std::collections::HashMap;
 use std::sync::Arc;
 
-use arrow_array::builder::{
-    ArrayBuilder as _, Float64Builder, TimestampNanosecondBuilder, UInt8Builder, UInt32Builder,
-};
+use arrow_array::builder::{ArrayBuilder as _, Float64Builder};
 use arrow_array::types::Int32Type;
-use arrow_array::{ArrayRef, RecordBatch};
+use arrow_array::{ArrayRef, RecordBatch, TimestampNanosecondArray, UInt8Array, UInt32Array};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use cantap_signals::{Decoder, Message, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
 use cantap_trace::{TraceFrame, TraceRecord};
@@ -25,9 +23,10 @@ const ROWS_AT_ONCE: usize = 512;
 /// time are the columns' and the table's metadata.
 pub struct MessageColumns {
     schema: SchemaRef,
-    time: TimestampNanosecondBuilder,
-    channel: UInt8Builder,
-    id: UInt32Builder,
+    /// What every row has.
+    time_ns: Vec<i64>,
+    channel: Vec<u8>,
+    id: Vec<u32>,
     signals: Vec<Column>,
     /// The last rows' frames, of which there are no values in the columns yet.
     waiting: MessageRows,
@@ -108,9 +107,9 @@ impl MessageColumns {
         }
         Self {
             schema: Arc::new(Schema::new_with_metadata(fields, about)),
-            time: TimestampNanosecondBuilder::new().with_timezone(events::UTC),
-            channel: UInt8Builder::new(),
-            id: UInt32Builder::new(),
+            time_ns: Vec::new(),
+            channel: Vec::new(),
+            id: Vec::new(),
             signals,
             waiting: decoder.rows(reference),
             values: 0,
@@ -166,9 +165,9 @@ impl MessageColumns {
     }
 
     fn begin_row(&mut self, record: &TraceRecord, frame: &TraceFrame) {
-        self.time.append_value(record.time_ns);
-        self.channel.append_value(record.channel);
-        self.id.append_value(frame.id().raw());
+        self.time_ns.push(record.time_ns);
+        self.channel.push(record.channel);
+        self.id.push(frame.id().raw());
     }
 
     /// Decodes the frames that wait for it.
@@ -189,7 +188,7 @@ impl MessageColumns {
 
     /// Columns without a value in the last rows get none.
     fn fill(&mut self) {
-        let rows = self.time.len();
+        let rows = self.time_ns.len();
         for column in &mut self.signals {
             let missing = rows - column.value.len();
             if missing > 0 {
@@ -203,7 +202,7 @@ impl MessageColumns {
 
     /// Rows so far.
     pub fn rows(&self) -> usize {
-        self.time.len()
+        self.time_ns.len()
     }
 
     /// How many values were decoded so far, those included that only say that there is none.
@@ -215,8 +214,12 @@ impl MessageColumns {
     /// The rows so far; the next ones begin a new batch.
     pub fn take(&mut self) -> RecordBatch {
         self.decode();
-        let mut columns: Vec<ArrayRef> =
-            vec![Arc::new(self.time.finish()), Arc::new(self.channel.finish()), Arc::new(self.id.finish())];
+        let time = TimestampNanosecondArray::from(std::mem::take(&mut self.time_ns));
+        let mut columns: Vec<ArrayRef> = vec![
+            Arc::new(time.with_timezone(events::UTC)),
+            Arc::new(UInt8Array::from(std::mem::take(&mut self.channel))),
+            Arc::new(UInt32Array::from(std::mem::take(&mut self.id))),
+        ];
         for column in &mut self.signals {
             columns.push(Arc::new(column.value.finish()));
             columns.extend(column.text.as_mut().map(|(texts, _)| texts.take()));

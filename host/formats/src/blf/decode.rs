@@ -5,18 +5,18 @@ use std::io;
 use flate2::{Decompress, FlushDecompress, Status};
 
 use super::super::calendar::Date;
-use super::super::codec::{Decode, REQUESTS_TO_SEND};
+use super::super::codec::{BATCH, Decode, REQUESTS_TO_SEND};
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
 use super::super::zone::Zone;
 use super::object::{Content, event, u16_at, u32_at, u64_at};
 use super::{
-    BASE_HEADER_BYTES, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES, EVENT_COMMENT,
-    FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, LOG_CONTAINER, OBJECT_MAGIC, START_OFFSET,
-    TIME_IN_TEN_US,
+    BASE_HEADER_BYTES, CAN_MESSAGE, CAN_MESSAGE2, COMPRESSION_NONE, COMPRESSION_ZLIB, CONTAINER_FIELDS_BYTES,
+    DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HEADER_BYTES,
+    LOG_CONTAINER, OBJECT_MAGIC, REMOTE, REQUESTED, SENT, START_OFFSET, TIME_IN_TEN_US,
 };
-use cantap_trace::{TraceEvent, TraceRecord};
+use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
 
 /// Reads BLF.
 pub(crate) struct Decoder {
@@ -93,6 +93,23 @@ impl Decoder {
 impl Decode for Decoder {
     fn needs_one_line(&self) -> bool {
         false
+    }
+
+    fn batch(&mut self, input: &mut Input, records: &mut Vec<TraceRecord>) -> io::Result<Option<Found>> {
+        loop {
+            self.frames(records);
+            // Nothing that is there waits for what comes.
+            if records.len() >= BATCH || input.may_wait() && !records.is_empty() {
+                return Ok(None);
+            }
+            match self.next(input)? {
+                Found::Record(record) => records.push(record),
+                other => return Ok(Some(other)),
+            }
+            if records.len() >= BATCH || input.may_wait() {
+                return Ok(None);
+            }
+        }
     }
 
     #[inline]
@@ -248,6 +265,51 @@ impl Decoder {
         }
     }
 
+    /// Appends classical frames, of which traces are full, up to the first object that is anything else or that there is anything to say
+    /// about: that is for [`Self::object`]. Without its checks one by one, and without copying a record more than once.
+    fn frames(&mut self, records: &mut Vec<TraceRecord>) {
+        const FIELDS_BYTES: usize = 16;
+        const LEN: usize = HEADER_BYTES + FIELDS_BYTES;
+        /// Signature, header of 32 bytes in its first version, and length, as they stand in each of these objects.
+        const HEAD: [u8; 12] = [b'L', b'O', b'B', b'J', HEADER_BYTES as u8, 0, 1, 0, LEN as u8, 0, 0, 0];
+        if self.loss_told {
+            return;
+        }
+        let room = BATCH.saturating_sub(records.len());
+        for object in self.objects[self.at..].chunks_exact(LEN).take(room) {
+            let Some(object) = object.first_chunk::<LEN>() else { return };
+            let field =
+                |at: usize| u32::from_le_bytes([object[at], object[at + 1], object[at + 2], object[at + 3]]);
+            if object[..HEAD.len()] != HEAD || !matches!(field(12), CAN_MESSAGE | CAN_MESSAGE2) {
+                return;
+            }
+            let (flags, dlc, raw, channel) = (object[34], object[35], field(36), object[32]);
+            let direction = match flags & DIRECTION {
+                SENT => Direction::Tx,
+                REQUESTED => return,
+                _ => Direction::Rx,
+            };
+            let id = raw & !EXTENDED;
+            let id = if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) };
+            let (Some(id), 0..=15, 0) = (id, dlc, object[33]) else { return };
+            let data = std::array::from_fn(|at| object[40 + at]);
+            let frame = Frame::from_bus(id, flags & REMOTE != 0, dlc, data).into();
+            records.push(TraceRecord {
+                time_ns: self.time_ns(field(16), u64::from(field(24)) | u64::from(field(28)) << 32),
+                channel,
+                event: TraceEvent::Frame { frame, direction, late: false },
+            });
+            self.at += LEN;
+        }
+    }
+
+    /// An object's time, of the unit that its flags tell.
+    #[inline]
+    fn time_ns(&self, flags: u32, time: u64) -> i64 {
+        let offset_ns = if flags == TIME_IN_TEN_US { time.saturating_mul(10_000) } else { time };
+        self.start_ns.saturating_add(i64::try_from(offset_ns).unwrap_or(i64::MAX))
+    }
+
     /// The next object in `objects`.
     #[inline]
     fn object(&mut self) -> Object {
@@ -278,10 +340,7 @@ impl Decoder {
             let found = format!("{header_len} bytes");
             return Object::Issue(Fault::malformed("an object's header with a time", found.as_bytes()));
         }
-        let time = u64_at(object, 24);
-        let offset_ns = if u32_at(object, 16) == TIME_IN_TEN_US { time.saturating_mul(10_000) } else { time };
-        let offset_ns = i64::try_from(offset_ns).unwrap_or(i64::MAX);
-        let time_ns = self.start_ns.saturating_add(offset_ns);
+        let time_ns = self.time_ns(u32_at(object, 16), u64_at(object, 24));
         let told = std::mem::take(&mut self.loss_told);
         match event(kind, &object[header_len..], told) {
             Ok(Content::Event(channel, event)) => {

@@ -1,9 +1,9 @@
 //! OBD-II: what the services of SAE J1979 carry, with values in their units.
 
 use super::parameters::{length, name, values};
-use super::values::{supported, text_or_bytes};
+use super::values::{number, supported};
 use super::{dtc, monitors, names};
-use crate::{Field, Value};
+use crate::Field;
 
 /// What a request asks for, behind the service byte.
 pub fn request(sid: u8, rest: &[u8], fields: &mut Vec<Field>) {

@@ -2,6 +2,7 @@
 
 use std::fmt::Write as _;
 
+use super::values::number;
 use super::{dtc, names, reports, values};
 use crate::Field;
 
@@ -156,7 +157,6 @@ fn file(data: &[u8], fields: &mut Vec<Field>) {
 /// Address and size behind a byte with their lengths (ISO 14229-1:2020, H.1).
 fn memory(lengths: u8, data: &[u8], fields: &mut Vec<Field>) {
     let (address, size) = (usize::from(lengths & 15), usize::from(lengths >> 4));
-    let number = |bytes: &[u8]| bytes.iter().fold(0_u64, |number, byte| number << 8 | u64::from(*byte));
     if address == 0 || address > 8 || size > 8 || data.len() < address + size {
         fields.push(Field::hex("lengths", lengths, 2));
         rest("parameters", data, fields);

@@ -124,7 +124,7 @@ impl SignalPlan {
         let scale = self.scale;
         match self.conversion {
             // What fits into a signed number is converted in one instruction.
-            Conversion::Unsigned if mask <= i64::MAX as u64 => {
+            Conversion::Unsigned if i64::try_from(mask).is_ok() => {
                 scale.apply_all(raw.iter().map(|raw| *raw as i64 as f64), value);
             }
             Conversion::Unsigned => scale.apply_all(raw.iter().map(|raw| *raw as f64), value),

@@ -9,6 +9,7 @@ mod blocks;
 mod decode;
 mod encode;
 mod layout;
+mod record;
 mod stream;
 #[cfg(test)]
 mod tests;

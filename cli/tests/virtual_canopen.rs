@@ -34,7 +34,7 @@ fn python_canopen_masters_the_nodes_and_a_listener_hears_the_same() {
     let folder = tempfile::tempdir().unwrap();
     let socket = folder.path().join("cantap.sock").display().to_string();
     let sheet = folder.path().join("node.eds");
-    let printed = Command::new(CANTAP).args(["virtual", "--eds"]).output().unwrap();
+    let printed = Command::new(CANTAP).args(["virtual", "--print-eds"]).output().unwrap();
     std::fs::write(&sheet, &printed.stdout).unwrap();
     let mut server = Command::new(CANTAP)
         .args(["serve", "-d", "virtual:canopen", "-b", "500k", "--unix", &socket])

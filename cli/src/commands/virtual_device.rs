@@ -13,7 +13,7 @@ use crate::interrupt;
 #[command(after_help = "Options, separated by commas:\n  \
                         car              a vehicle: 500k on channel 1, 125k on channel 2, its database is printed by --dbc;\n                   \
                         it goes with errors, disturb, ack, channels, seed, settings, pace, ppm and serial\n  \
-                        canopen          CANopen nodes on channel 1, one of them without a number; --eds prints their sheet;\n                   \
+                        canopen          CANopen nodes on channel 1, one of them without a number; --print-eds prints their sheet;\n                   \
                         it does not go with load, frames, burst and log\n  load=PCT         bus load, 0 to 100 (50)\n  \
                         frames=KIND      std0, std8, ext0, ext8, rtr, mix (mix)\n  \
                         bitrate=RATE     of the bus (that of whoever opens the channel)\n  \
@@ -37,11 +37,11 @@ pub struct Args {
     #[arg(default_value = "")]
     options: Options,
     /// Print the database of the vehicle (a DBC file) and leave.
-    #[arg(long, conflicts_with = "eds")]
+    #[arg(long, conflicts_with = "print_eds")]
     dbc: bool,
     /// Print the sheet of the CANopen nodes (an EDS file) and leave.
     #[arg(long)]
-    eds: bool,
+    print_eds: bool,
 }
 
 /// Runs it.
@@ -50,7 +50,7 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
         std::io::stdout().lock().write_all(car::DATABASE.as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }
-    if args.eds {
+    if args.print_eds {
         std::io::stdout().lock().write_all(canopen::SHEET.as_bytes())?;
         return Ok(ExitCode::SUCCESS);
     }

@@ -1,13 +1,16 @@
-//! A program that ends without warning leaves files that other programs read: what was flushed is there, whole.
+//! A program that ends without warning leaves files that other programs read: what was flushed is there, whole. So it is to whoever reads
+//! on while a file is written.
 
 mod traces;
 
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use cantap_formats::{CsvDialect, Format, RotateAt, Rotation, WriteOptions, create_writer};
+use cantap_formats::{
+    CsvDialect, Format, ReadOptions, RotateAt, Rotation, TrcVersion, WriteOptions, create_writer, open_reader,
+};
 use traces::{directory, file_name, read, real, write};
 
 /// The options that write a format.
@@ -51,14 +54,43 @@ fn what_was_flushed_is_a_whole_file_whatever_happens_afterwards() {
             let same = directory.join(format!("whole-{}", file_name(format, "")));
             write(&same, format, &records[..left.len()]);
             assert!(left == read(&same).0, "{place}");
-            // Nothing of a provisional end may be left between the rows. Statistics at the end of a pcapng file are no part of it: whoever
-            // reads it while it grows has read on behind them.
+            // Nothing of a provisional end may be left between the rows. Statistics at the end of a pcapng file, and ASC's last line, are no
+            // part of it: whoever reads the file while it grows has read on behind them.
             if compression.is_empty() && !matches!(format, Format::Blf) {
                 let (left, whole) = (fs::read(&path).unwrap(), fs::read(&same).unwrap());
                 assert!(whole.starts_with(&left), "{place}");
-                assert!(left.len() == whole.len() || format == Format::Pcapng, "{place}");
+                assert!(
+                    left.len() == whole.len() || matches!(format, Format::Asc | Format::Pcapng),
+                    "{place}"
+                );
             }
             test_by_its_own_program(&path);
+        }
+    }
+}
+
+/// Each record is read as soon as it is flushed. Not in the tables of the earlier analyser, which have a provisional end that is written over.
+#[test]
+fn a_file_can_be_followed_while_it_is_written() {
+    let directory = directory("followed");
+    let records = real(200);
+    for format in [Format::Candump, Format::Asc, Format::Trc(TrcVersion::V2_1), Format::Pcapng] {
+        let path = directory.join(file_name(format, ""));
+        let mut writer = create_writer(&path, &options(format)).unwrap();
+        let mut reader = None;
+        for record in &records {
+            writer.write(record).unwrap();
+            writer.flush().unwrap();
+            let reader = reader.get_or_insert_with(|| {
+                let mut reader =
+                    open_reader(&path, &ReadOptions { follow: true, ..ReadOptions::default() }).unwrap();
+                let patience = Instant::now() + Duration::from_secs(60);
+                reader.end_when(move || Instant::now() > patience);
+                reader
+            });
+            let read = reader.next().unwrap_or_else(|| panic!("{format}: a record never came"));
+            let read = read.unwrap_or_else(|issue| panic!("{format}: {issue}"));
+            assert_eq!(read.event, record.event, "{format}");
         }
     }
 }

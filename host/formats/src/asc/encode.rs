@@ -133,12 +133,6 @@ impl Encode for Encoder {
         }
         out.extend_from_slice(END);
     }
-
-    fn provisional_end(&self, out: &mut Vec<u8>) {
-        if self.start_ns.is_some() {
-            out.extend_from_slice(END);
-        }
-    }
 }
 
 /// What stands behind the time of a frame.

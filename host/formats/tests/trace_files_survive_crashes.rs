@@ -84,7 +84,7 @@ fn a_file_can_be_followed_while_it_is_written() {
             let reader = reader.get_or_insert_with(|| {
                 let mut reader =
                     open_reader(&path, &ReadOptions { follow: true, ..ReadOptions::default() }).unwrap();
-                let patience = Instant::now() + Duration::from_secs(60);
+                let patience = Instant::now() + Duration::from_mins(1);
                 reader.end_when(move || Instant::now() > patience);
                 reader
             });

@@ -75,9 +75,13 @@ pub fn run(args: &Args) -> Result<()> {
 
     let steps = if args.only.is_empty() { Step::value_variants() } else { &args.only };
     let shell = workspace::shell()?;
-    if std::env::var_os("CI").is_some() && std::env::var_os("CARGO_INCREMENTAL").is_none() {
-        // Nothing is compiled twice there.
-        shell.set_var("CARGO_INCREMENTAL", "0");
+    if std::env::var_os("CI").is_some() {
+        // Nothing is compiled twice there, and nobody looks with a debugger.
+        for name in ["CARGO_INCREMENTAL", "CARGO_PROFILE_DEV_DEBUG"] {
+            if std::env::var_os(name).is_none() {
+                shell.set_var(name, "0");
+            }
+        }
     }
     let toolchain = Toolchain::find_or_install(&shell)?;
     let peers = Peers::find_or_install(&shell)?;

@@ -59,10 +59,10 @@ enum Step {
     Reproducible,
     /// Every test, those that run the firmware's ELF on the emulated board included.
     Tests,
-    /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
-    Python,
     /// A stock Linux kernel under QEMU drives the firmware on the emulated board.
     Kernel,
+    /// The package for Python: wheel, types, tests, python-can's own tests, notebooks.
+    Python,
     /// The command that a newcomer runs first: both channels at full load, nothing lost.
     Demo,
     /// The crates as they would be published: each packs.
@@ -136,8 +136,8 @@ impl Step {
             Step::ClippyFirmware => firmware::clippy(shell, toolchain)?,
             Step::Reproducible => reproducible::check(shell, toolchain)?,
             Step::Tests => tests::run(shell, peers)?,
-            Step::Python => return python::check(shell, peers),
             Step::Kernel => return kernel::run(shell),
+            Step::Python => return python::check(shell, peers),
             Step::Demo => cmd!(shell, "cargo demo --time 3s").run()?,
             Step::Package => package::check(shell)?,
         }

@@ -193,7 +193,10 @@ fn collect(
     };
     if !version.starts_with(b"4.") {
         let version = String::from_utf8_lossy(version).trim().to_owned();
-        return Err(Fault::Unsupported(format!("MDF {version}, which is older than 4.0,").into()));
+        return Err(Fault::Malformed {
+            expected: "MDF 4.0 or later, into which programs for MDF convert older files".into(),
+            found: format!("MDF {version}"),
+        });
     }
     let open = if is_unfinished { u16_at(&identification, UNFINISHED_AT) } else { 0 };
     let header = file.block(HEADER_AT, *b"##HD")?;

@@ -237,7 +237,10 @@ fn a_file_cut_in_its_first_bytes_is_named() {
 #[test]
 fn what_is_no_mdf_4_is_named() {
     for (file, message) in [
-        (b"MDF     3.30    ".to_vec(), "MDF 3.30, which is older than 4.0, cannot be represented"),
+        (
+            b"MDF     3.30    ".to_vec(),
+            "expected MDF 4.0 or later, into which programs for MDF convert older files, found MDF 3.30",
+        ),
         (b"rubbish and more".to_vec(), "expected a file that begins with 'MDF', found 'rubbish '"),
         (b"MDF     4.10    ".to_vec(), "the file ends inside what describes the measurement"),
     ] {

@@ -3,12 +3,12 @@
 use cantap::Channel;
 use cantap::device::channel_number;
 use cantap::wire::CHANNELS;
+use cantap_address::{Address, OpenDevice};
 use cantap_trace::filter::Filter;
 
 use crate::args::Channels;
 use crate::completion;
 use crate::wrong::wrong;
-use cantap_address::{Address, OpenDevice};
 
 /// More than this many boards no command takes: channels are numbered up to 32.
 const MOST: usize = 16;

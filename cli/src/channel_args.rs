@@ -8,13 +8,13 @@ use cantap::device::channel_number;
 use cantap::hw_filter::{self, Compiled};
 use cantap::recovery::Recovery;
 use cantap::wire::message::{ChannelConfig, Defaults, Mode};
+use cantap_address::OpenDevice;
 use cantap_trace::filter::Filter;
 
 use crate::args;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::rescue::Rescue;
 use crate::timing_args::TimingArgs;
-use cantap_address::OpenDevice;
 
 /// How to open a channel; for commands to flatten into theirs.
 #[derive(clap::Args, Clone, Debug, Default)]

@@ -7,12 +7,12 @@ use std::ffi::OsStr;
 use std::path::{Path, PathBuf};
 
 use cantap::wire::CHANNELS;
+use cantap_address::Address;
 use cantap_formats::Format;
 use cantap_signals::Database;
 use clap_complete::engine::{ArgValueCompleter, CompletionCandidate, PathCompleter, ValueCompleter};
 
 use crate::shells;
-use cantap_address::Address;
 
 /// Suffixes of databases.
 const DATABASES: [&str; 5] = ["dbc", "kcd", "sym", "arxml", "toml"];

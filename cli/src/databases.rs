@@ -4,10 +4,10 @@ use std::path::{Path, PathBuf};
 use std::str::FromStr;
 
 use anyhow::{Context, bail};
+use cantap_address::Address;
 use cantap_signals::{Database, DatabaseError, Decoder, Override, Selection, Source};
 
 use crate::completion;
-use cantap_address::Address;
 
 /// Which databases; for commands to flatten into theirs.
 #[derive(Clone, clap::Args)]

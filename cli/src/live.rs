@@ -8,6 +8,7 @@ use anyhow::{anyhow, bail};
 use cantap::TraceRecord;
 use cantap::device::{Happening, Reconnecting, Return, Several, channel_number};
 use cantap::wire::message::{ChannelConfig, Mode};
+use cantap_address::{Address, OpenDevice};
 use cantap_formats::ChannelInfo;
 
 use crate::boards::{Boards, filters_on, place_of};
@@ -16,7 +17,6 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::completion;
 use crate::hearing::{self, Hearing};
 use crate::{advice, args, interrupt, stderr};
-use cantap_address::{Address, OpenDevice};
 
 /// Which devices, and how; for commands to flatten into theirs, beside an input file.
 #[derive(clap::Args)]

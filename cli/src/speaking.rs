@@ -11,6 +11,7 @@ use cantap::device::Records;
 use cantap::transmit::Stream;
 use cantap::wire::message::{Mode, Periodic};
 use cantap::{Channel, Frame, TraceEvent, TraceRecord, periodic};
+use cantap_address::{Address, OpenDevice};
 use cantap_protocols::active::Machine;
 use cantap_protocols::{Assembler, Event};
 
@@ -23,7 +24,6 @@ use crate::sending::Sending;
 use crate::words::{counted, state_name};
 use crate::wrong::wrong;
 use crate::{args, interrupt};
-use cantap_address::{Address, OpenDevice};
 
 /// The longest time between two looks at what is being sent, and at Ctrl-C.
 const LOOK_EVERY: Duration = Duration::from_millis(20);

@@ -3,13 +3,13 @@
 use std::time::Duration;
 
 use anyhow::Context;
+use cantap_address::Address;
 use cantap_signals::trigger::{Trigger, Window};
 
 use crate::args;
 use crate::completion;
 use crate::databases::DatabaseArgs;
 use crate::protocols;
-use cantap_address::Address;
 
 /// When to keep records; for commands to flatten into theirs.
 #[derive(clap::Args)]

@@ -18,6 +18,7 @@ use cantap::Device;
 use cantap::device::{Happening, Reconnecting};
 use cantap::wire::Channel;
 use cantap::wire::message::Mode;
+use cantap_address::OpenDevice;
 
 use self::interface::CanPort;
 use self::lane::Lane;
@@ -27,7 +28,6 @@ use crate::channel_args::ChannelArgs;
 use crate::hearing::{self, Hearing};
 use crate::wrong::wrong;
 use crate::{advice, args, interrupt, live, stderr};
-use cantap_address::OpenDevice;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -8,6 +8,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
 use cantap::{TraceEvent, TraceRecord};
+use cantap_address::Address;
 use cantap_formats::{ChannelInfo, Format, ReadOptions, WriteOptions, open_reader};
 use cantap_signals::trigger::Trigger;
 use cantap_trace::filter::Filter;
@@ -25,7 +26,6 @@ use crate::progress::Progress;
 use crate::trace_output::refuse_older;
 use crate::trigger_args::TriggerArgs;
 use crate::wrong::wrong;
-use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

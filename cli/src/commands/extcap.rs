@@ -17,6 +17,7 @@ use std::process::ExitCode;
 
 use anyhow::Context;
 use cantap::wire::message::Mode;
+use cantap_address::Address;
 use cantap_trace::filter::Filter;
 
 use self::bit_rates::BitRate;
@@ -24,7 +25,6 @@ use self::capture::Wanted;
 use self::toolbar::Toolbar;
 use crate::completion;
 use crate::wrong::wrong;
-use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -8,6 +8,7 @@ use std::time::Duration;
 
 use anyhow::{Context, bail};
 use cantap::wire::message::Mode;
+use cantap_address::{Address, AddressError};
 use cantap_formats::WriteOptions;
 use cantap_trace::filter::Filter;
 
@@ -27,7 +28,6 @@ use crate::monitor::{Once, once, orders, picture, run as show, text};
 use crate::trace_output::{named, refuse_older};
 use crate::wrong::wrong;
 use crate::{args, beside};
-use cantap_address::{Address, AddressError};
 
 /// The command line.
 #[derive(clap::Args)]

@@ -12,11 +12,11 @@ use std::time::Duration;
 
 use anyhow::Context;
 use cantap::{Channel, Device};
+use cantap_address::{Address, OpenDevice};
 
 use self::report::{Outcome, Report};
 use crate::boards::OneBoard;
 use crate::{args, beside, exit, interrupt};
-use cantap_address::{Address, OpenDevice};
 
 /// The command line.
 #[derive(clap::Args)]

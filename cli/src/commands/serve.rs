@@ -17,6 +17,8 @@ use anyhow::{Context, bail};
 use cantap::Channel;
 use cantap::device::{channel_number, pipe, write_patiently};
 use cantap::wire::CHANNELS;
+use cantap_address::server::{PORT, role};
+use cantap_address::{Address, LinkError};
 use cantap_serve::listen::{self, Listening};
 use cantap_serve::{Board, BoardError, News, Role, Settings, connect, lines, socketcand};
 
@@ -26,8 +28,6 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::timing_args::TimingArgs;
 use crate::wrong::wrong;
 use crate::{interrupt, stderr};
-use cantap_address::server::{PORT, role};
-use cantap_address::{Address, LinkError};
 
 /// The command line.
 #[derive(clap::Args)]

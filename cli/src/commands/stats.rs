@@ -10,6 +10,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::Context;
+use cantap_address::Address;
 use cantap_analysis::stats::{Options, PeakSummary, Statistics, Summary};
 
 use self::windows::Windows;
@@ -19,7 +20,6 @@ use crate::completion;
 use crate::input::ReadArgs;
 use crate::missing::{Missing, by_kind};
 use crate::protocols::{Known, ProtocolArgs};
-use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

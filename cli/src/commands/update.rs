@@ -5,9 +5,9 @@ use std::path::{Path, PathBuf};
 use std::process::{Command, ExitCode};
 
 use anyhow::{Context, bail};
+use cantap_address::Address;
 
 use crate::completion;
-use cantap_address::Address;
 
 /// The command line.
 #[derive(clap::Args)]

@@ -4,10 +4,10 @@ use cantap::Channel;
 use cantap::device::channel_number;
 use cantap::wire::CHANNELS;
 use cantap::wire::message::Mode;
+use cantap_address::Address;
 
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
-use cantap_address::Address;
 
 /// Which devices, and how to take part in their buses.
 #[derive(Clone, Debug)]

@@ -13,13 +13,13 @@ use cantap::transmit::Stream;
 use cantap::wire::Frame;
 use cantap::wire::message::Mode;
 use cantap::{Device, DeviceError};
+use cantap_address::OpenDevice;
 use rustix::event::{PollFd, PollFlags, poll};
 
 use super::frames::{RawFrame, frame_of};
 use super::interface::BATCH;
 use super::lane::Lane;
 use crate::{advice, stderr};
-use cantap_address::OpenDevice;
 
 /// How often to look for confirmations while frames are on their way.
 const CONFIRM_EVERY: Duration = Duration::from_millis(2);

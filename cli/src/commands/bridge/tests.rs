@@ -12,6 +12,7 @@ use cantap::device::Records;
 use cantap::wire::message::{ChannelConfig, Mode, TxFrame};
 use cantap::wire::record::{LossStage, TransmitFailure};
 use cantap::{Channel, TraceEvent, TraceRecord};
+use cantap_address::{Address, OpenDevice};
 use cantap_trace::socketcan::{ERROR_FLAG, ErrorFrame};
 
 use super::frames::{RawFrame, frame_of, raw_frame};
@@ -19,7 +20,6 @@ use super::interface::{Known, Port};
 use super::lane::Lane;
 use super::places;
 use super::sender::Sender;
-use cantap_address::{Address, OpenDevice};
 
 /// An interface in memory.
 #[derive(Default)]

@@ -4,13 +4,13 @@ use std::io::{self, Write};
 use std::path::Path;
 
 use cantap::device::{Gaps, channel_number};
+use cantap_address::Address;
 use cantap_signals::trigger::{Trigger, TriggerCounts};
 
 use crate::boards::Boards;
 use crate::live::{Line, LiveRecords};
 use crate::losses::Losses;
 use crate::meter::{Meter, rounded};
-use cantap_address::Address;
 
 /// A channel in the JSON object.
 #[derive(serde::Serialize)]

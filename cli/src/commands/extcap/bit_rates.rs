@@ -5,11 +5,11 @@ use std::time::Duration;
 
 use cantap::Channel;
 use cantap::autobaud::{self, Limits, Outcome};
+use cantap_address::Address;
 
 use super::super::autobaud::failure;
 use crate::channel_bitrate::ChannelBitrate;
 use crate::{args, interrupt};
-use cantap_address::Address;
 
 /// Those that are offered in words; any other can be given, too.
 pub const OFFERED: [(&str, &str); 12] = [

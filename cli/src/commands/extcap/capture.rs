@@ -8,6 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 use anyhow::Context;
 use cantap::wire::message::{ChannelConfig, Mode};
 use cantap::{Channel, Device, DeviceError, TraceRecord};
+use cantap_address::Address;
 use cantap_formats::{Format, TraceWriter, WriteOptions, create_stream_writer};
 use cantap_trace::filter::Filter;
 
@@ -20,7 +21,6 @@ use crate::channel_args::{self, ChannelArgs};
 use crate::live::{Line, LiveRecords};
 use crate::losses::Losses;
 use crate::{advice, args, exit, interrupt};
-use cantap_address::Address;
 
 /// How long a reader waits at most for what is captured while there is more; what is captured on a quiet bus goes at once. Two saturated
 /// channels have 208 frames in this time.

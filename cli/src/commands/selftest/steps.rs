@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 use cantap::wire::message::{Defaults, Hello};
 use cantap::wire::{CHANNELS, PROTOCOL_VERSION};
 use cantap::{Channel, Device};
+use cantap_address::{Address, OpenDevice};
 use serde_json::{Value, json};
 
 use super::report::Outcome;
 use crate::meter::rounded;
-use cantap_address::{Address, OpenDevice};
 
 /// Questions for the device's time.
 const ROUND_TRIPS: usize = 500;

@@ -4,11 +4,11 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
+use cantap_address::server::role;
 use cantap_serve::Role;
 use cantap_serve::tls::{Files, Keys, Server};
 
 use crate::wrong::wrong;
-use cantap_address::server::role;
 
 /// What there is to do beside serving.
 #[derive(clap::Subcommand)]

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
+use cantap_address::Address;
 use cantap_analysis::stats::{Statistics, Window};
 
 use super::table::remarks;
@@ -13,7 +14,6 @@ use crate::channel_bitrate::ChannelBitrate;
 use crate::live::{LiveRecords, unasked};
 use crate::protocols::Known;
 use crate::stderr;
-use cantap_address::Address;
 
 /// How long after its end a window is closed, so that what is still on the way gets into it.
 const LATENESS_NS: i64 = 1_000_000_000;

@@ -1,6 +1,7 @@
 //! Another device, other bit rates, another mode.
 
 use cantap::wire::message::Mode;
+use cantap_address::{Address, AddressError};
 use cantap_analysis::stats::Statistics;
 
 use super::super::model::{LOAD_WINDOW, Model};
@@ -9,7 +10,6 @@ use super::super::plan::Plan;
 use super::line::PromptKind;
 use super::state::App;
 use crate::channel_bitrate::ChannelBitrate;
-use cantap_address::{Address, AddressError};
 
 impl App {
     /// Between listen-only and taking part, which is asked for: whatever acknowledges changes the bus.

@@ -2,13 +2,13 @@
 
 use std::path::Path;
 
+use cantap_address::Address;
 use cantap_formats::Format;
 
 use super::super::model::Model;
 use super::state::App;
 use super::wish::Wish;
 use crate::databases::Said;
-use cantap_address::Address;
 
 impl App {
     /// A database is used from now on, besides the others; a trace is opened beside what runs.

@@ -194,7 +194,8 @@ fn the_suffix_chooses_the_format() {
     assert_eq!(message, "'b.gif' names no picture format; let it end in .svg, .png or .html");
 }
 
-/// Writes the pictures to a folder for inspection: `CANTAP_PICTURES=DIR cargo test -p cantap pictures`.
+/// Writes the pictures to a folder for inspection: `CANTAP_PICTURES=DIR cargo test -p cantap-analysis
+/// --all-features pictures`.
 #[test]
 fn pictures_to_look_at_can_be_written() {
     let folder = std::env::var_os("CANTAP_PICTURES").map_or_else(std::env::temp_dir, Into::into);

@@ -40,7 +40,7 @@ impl FastPackets {
         self.open.values().map(|(message, _)| message)
     }
 
-    /// Ends what has waited for too long.
+    /// Ends whatever has timed out.
     pub fn advance(&mut self, now_ns: i64, out: &mut impl FnMut(Assembled)) {
         if self.open.is_empty() || now_ns < self.sweep_ns {
             return;

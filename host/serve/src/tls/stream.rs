@@ -81,8 +81,8 @@ fn step(mut stream: &TcpStream, connection: &mut Connection) -> io::Result<()> {
 
 impl Secured {
     /// Waits for the first message from the other side after the handshake. In TLS 1.3, the handshake is over for a client before
-    /// the server has checked its certificate: an error shows that the server rejected it. A server that says nothing has accepted
-    /// it.
+    /// the server has checked its certificate: an error shows that the server rejected it. A server need not say
+    /// anything.
     pub fn wait_for_verdict(&self, deadline: Instant) -> io::Result<()> {
         let mut raw = vec![0; PIECE];
         while Instant::now() < deadline {

@@ -1,4 +1,4 @@
-//! Tests that run the firmware's ELF are compiled as ignored where there is none: a test that shows nothing must not say "ok".
+//! Tests that run the firmware's ELF are compiled as ignored if there is none: a test that shows nothing must not say "ok".
 
 fn main() {
     println!("cargo:rerun-if-changed=build.rs");

@@ -229,8 +229,8 @@ pub fn batches_of(object: &Bound<'_, PyAny>) -> PyResult<Box<dyn RecordBatchRead
     };
     let capsule = export.call0()?.cast_into::<PyCapsule>()?;
     let pointer = capsule.pointer_checked(Some(STREAM))?.cast::<FFI_ArrowArrayStream>();
-    // SAFETY: the name says that the capsule has an initialised stream, which the interface lets its one consumer take. What
-    // is left behind is marked as released, which the capsule's destructor looks at.
+    // SAFETY: the name says that the capsule has an initialised stream, which the interface lets its only consumer take. The
+    // original is then marked as released, which the capsule's destructor checks.
     let reader = unsafe { RecordBatchStreamReader::from_raw(pointer.as_ptr()) };
     Ok(Box::new(reader.map_err(arrow_error)?))
 }

@@ -46,7 +46,7 @@ class Entry:
     faults: list[str] = field(default_factory=list)
     #: What is well-formed and no part of a CAN trace, by kind.
     left_out: dict[str, int] = field(default_factory=dict)
-    #: What is nothing wrong and should be known, by kind.
+    #: What is not wrong but should be known, by kind.
     notes: dict[str, int] = field(default_factory=dict)
     databases: list[str] = field(default_factory=list)
 

@@ -251,7 +251,7 @@ mod tests {
     fn filters_list_the_past_and_what_comes_and_keep_what_they_do_not_list() {
         let mut history = History::new(0);
         (0..10).for_each(|n| history.push(frame(n)));
-        // The fifth record is not listed any more: the next one is.
+        // The fifth record is no longer listed: the next one is.
         assert_eq!(history.set_filters(vec!["123:7FF".parse().unwrap()], Some(5)), Some(2));
         assert_eq!(listed(&history), [0, 3, 6, 9]);
         (10..1004).for_each(|n| history.push(frame(n)));
@@ -259,7 +259,7 @@ mod tests {
         assert_eq!(listed(&history), (6..1004).step_by(3).collect::<Vec<_>>());
         assert_eq!(history.set_filters(Vec::new(), Some(2)), Some(6));
         assert_eq!(listed(&history), (4..1004).collect::<Vec<_>>());
-        // Nothing is listed, and a place behind the end is none.
+        // Nothing is listed, and a position after the end does not exist.
         assert_eq!(history.set_filters(vec!["7FF:7FF".parse().unwrap()], Some(500)), Some(0));
         assert_eq!((history.first(), history.end(), history.get(0)), (0, 0, None));
         history.clear();

@@ -65,12 +65,12 @@ _ARROW: dict[str, pa.DataType] = {
 
 
 def ddl(columns: dict[str, str]) -> str:
-    """The columns as Spark takes them."""
+    """The columns for Spark."""
     return ", ".join(f"`{name}` {kind}" for name, kind in columns.items())
 
 
 def schema(columns: dict[str, str]) -> pa.Schema:
-    """The columns as Arrow has them."""
+    """The columns for Arrow."""
     return pa.schema([(name, _ARROW[kind]) for name, kind in columns.items()])
 
 
@@ -78,7 +78,7 @@ STREAM_SCHEMA = schema(STREAM)
 
 
 def rows_of(batch: pa.RecordBatch, part: str, vehicle: str, trace: str, first_row: int) -> pa.RecordBatch:
-    """A batch of `cantap.scan` as rows of the stream; `first_row` is the number of its first within the trace."""
+    """A batch of `cantap.scan` as rows of the stream; `first_row` is the number of its first row within the trace."""
     rows = batch.num_rows
     time = batch.column("time")
     known: dict[str, pa.Array] = {

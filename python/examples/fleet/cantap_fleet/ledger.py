@@ -1,4 +1,4 @@
-"""The ledger: what became of each input."""
+"""The ledger: the result for each input."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FAILED = "failed"
 
 @dataclass
 class Entry:
-    """What became of one input. No times and no machines: running the job again gives the same."""
+    """The result for one input. It contains no times or machines: running the job again gives the same."""
 
     trace: str
     vehicle: str

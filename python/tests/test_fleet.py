@@ -1,6 +1,6 @@
 """The fleet's job on a Spark cluster of two worker processes: `python/examples/fleet`.
 
-Needs Java 17 and what `python/examples/fleet/requirements.txt` names; without pyspark it is skipped, and says so.
+Needs Java 17 and the packages in `python/examples/fleet/requirements.txt`; without pyspark it is skipped, and says so.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from pyspark.sql import SparkSession
 
 VEHICLES = 20
 TRACES_EACH = 10
-#: 2026-03-01 22:59:59 UTC: every trace goes over an hour, those of every fourth vehicle over midnight.
+#: 2026-03-01 22:59:59 UTC: every trace crosses a full hour, those of every fourth vehicle cross midnight.
 BEGIN_US = 1_772_405_999_000_000
 STEP_US = 10_000
 STEPS = 200
@@ -117,9 +117,9 @@ def write(path: Path, frames: list[Sent]) -> None:
 @dataclass
 class Fleet:
     folder: Path
-    #: Of traces that are whole, what the generator put in.
+    #: For complete traces, what the generator put in.
     whole: dict[str, list[Sent]]
-    #: Of the others, the state that they must have, and the frames: none where that is not known to the frame.
+    #: For the others, the state that they must have, and the number of frames: `None` if that is not known exactly.
     broken: dict[str, tuple[str, int | None]]
 
     @property

@@ -59,8 +59,8 @@ pub struct Args {
     /// Width: pixels in a file, columns in the terminal.
     #[arg(long)]
     width: Option<u32>,
-    /// Leave out everything before this time: since the trace's start (10s, 2m), a date, or seconds since
-    /// 1970.
+    /// Leave out everything before this time: since the trace's start (10s, 2m), seconds since 1970, or a
+    /// date.
     #[arg(long, value_name = "TIME", allow_hyphen_values = true)]
     start: Option<TimePoint>,
     /// Leave out everything from this time on; written like --start.

@@ -1,8 +1,8 @@
-"""Lets python-can's own tests run on the analyser: a pytest plugin that replaces python-can's virtual interface by it.
+"""Lets python-can's own tests run on the analyser: a pytest plugin that replaces python-can's virtual interface with it.
 
-Those tests open two buses of one name, which see each other: here they are the two channels of a virtual device on one bus. Each name is
-a device. They look at details of python-can's virtual interface and of its threads, which are added here and are no part of the plugin:
-how many messages wait (`queue`), and the thread of a periodic task (`thread`).
+Those tests open two buses with the same name, which see each other: here they are the two channels of a virtual device on one bus. Each
+name is a device. The tests use details of python-can's virtual interface and its threads, which are added here and are not part of the
+plugin: the number of waiting messages (`queue`), and the thread of a periodic task (`thread`).
 """
 
 import collections

@@ -1,7 +1,7 @@
-"""The columns of the datasets: `cantap`'s own, in types that Spark has.
+"""The columns of the datasets: `cantap`'s own, in Spark's types.
 
-Spark has neither unsigned integers nor nanoseconds: numbers take the next wider type, and beside `time`, in microseconds, there is
-`time_ns`.
+Spark has neither unsigned integers nor nanoseconds: numbers have the next wider type, and in addition to `time`, in microseconds,
+there is `time_ns`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ SIGNALS = COMMON | {
     "unit": "string",
 }
 FOLDERS = ["vehicle", "day", "channel"]
-#: A task hands over rows of both, and its part of the ledger, in one stream: `part` says which.
+#: A task delivers rows of both, and its part of the ledger, in one stream, marked by `part`.
 STREAM = {"part": "string"} | FRAMES | SIGNALS | {"entry": "string"}
 
 _ARROW: dict[str, pa.DataType] = {

@@ -1,9 +1,9 @@
-"""The dataset: written once, with proof that all of it is there.
+"""The dataset: written once, with proof that it is complete.
 
     OUTPUT/frames/vehicle=7/day=2026-03-01/channel=1/….parquet    a row per frame, loss, bus error
     OUTPUT/signals/vehicle=7/day=2026-03-01/channel=1/….parquet   a row per value, and the same losses and errors
     OUTPUT/vehicles/                                              what is known about each vehicle's buses
-    OUTPUT/ledger/                                                what became of each input; written last
+    OUTPUT/ledger/                                                the result for each input; written last
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from . import columns, inputs, ledger
 from .inputs import Bus, File, InputError
 from .worker import TRACES, Settings, decoder, local_path
 
-#: Files that Spark hands over as a value; Java's arrays end there.
+#: The largest file that Spark can pass as a value: the limit of Java's arrays.
 _LARGEST_VALUE = (1 << 31) - 16
 _VEHICLES = "vehicle string, channel smallint, bitrate bigint, data_bitrate bigint"
 

@@ -1,7 +1,7 @@
 """A process that decodes one trace after the other, so that a trace that hangs or kills it affects nothing else.
 
-It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, out of which they are
-handed on only when the whole trace is done. With whoever started it, it ends.
+It reads requests from standard input, a line of JSON each, and answers with a line of JSON. Rows go into a file, from which they
+are passed on only when the whole trace is done. It ends together with the process that started it.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Request(TypedDict):
     trace: str
     vehicle: str
     bytes: int
-    #: The channel that a database is for, none for all, and where it lies.
+    #: A database's channel (`None` for all), and its path.
     databases: list[tuple[int | None, str]]
-    #: Their names for the ledger.
+    #: Their names in the ledger.
     database_names: list[str]
     j1939: bool
-    #: Only these signals; all if there are none.
+    #: Only these signals; all if empty.
     signals: list[str]
     zone: str | None
     #: Where rows go.

@@ -10,7 +10,7 @@ from typing import Any
 
 from pyspark.sql import SparkSession
 
-#: What stands under this name counts for vehicles that have no line of their own.
+#: Lines with this name are for vehicles without a line of their own.
 ANY_VEHICLE = "*"
 _FIELDS = ["vehicle", "channel", "databases", "bitrate", "data_bitrate", "j1939"]
 
@@ -23,7 +23,7 @@ class InputError(Exception):
 class File:
     """A file of the input folder."""
 
-    #: As Hadoop writes it: with its scheme, nothing escaped.
+    #: As Hadoop writes it: with its scheme, and unescaped.
     url: str
     #: Under the input folder, with `/`.
     name: str
@@ -41,11 +41,11 @@ class Bus:
     """What is known about a vehicle's channel, or all its channels."""
 
     vehicle: str
-    #: From 1; `None` for all that have no line of their own.
+    #: From 1; `None` for all channels without a line of their own.
     channel: int | None
     #: Names under the input folder.
     databases: tuple[str, ...]
-    #: Bits per second; `None` where nobody has said.
+    #: Bits per second; `None` if unknown.
     bitrate: int | None
     data_bitrate: int | None
     j1939: bool

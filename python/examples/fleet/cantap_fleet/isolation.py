@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Any, cast
 
-#: How often a request is tried whose process dies: memory that was short may be there the next time.
+#: How often to try a request whose process dies: if memory was short, it may be available the next time.
 ATTEMPTS = 2
 
 

@@ -10,7 +10,7 @@ from pyspark.sql import DataFrame, SparkSession
 from . import columns, dataset, ledger
 from .inputs import InputError
 
-#: The questions, and the numbers in them that can be set.
+#: The questions, and their adjustable parameters.
 QUESTIONS: dict[str, dict[str, float]] = {
     "period_jitter": {},
     "condition": {"speed": 120.0, "pressure": 50.0},

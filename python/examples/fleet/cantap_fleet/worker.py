@@ -22,7 +22,7 @@ from .ledger import FAILED, REFUSED, Entry
 if TYPE_CHECKING:
     from pyspark import Broadcast
 
-#: The traces as workers get them. `setup` is JSON: the databases, each with its channel, and whether they are J1939.
+#: A trace, as passed to workers. `setup` is JSON: the databases, each with its channel, and whether they are J1939.
 TRACES = "url string, trace string, vehicle string, bytes bigint, setup string, content binary"
 
 

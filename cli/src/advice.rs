@@ -101,7 +101,7 @@ fn unknown_format<'e>(error: &'e (dyn Error + 'static)) -> Option<&'e UnknownFor
     within.and_then(|within| within.downcast_ref()).or_else(|| error.downcast_ref())
 }
 
-/// Whether an output's name or `--format` names no format. Input is recognised by its content, so a name that says nothing is no mistake there.
+/// Whether an output's name or `--format` names no format. Input is recognised by its content, so a name that says nothing is not a mistake there.
 pub fn is_unknown_format(error: &anyhow::Error) -> bool {
     error.chain().all(|cause| !cause.is::<OpenError>())
         && error.chain().any(|cause| unknown_format(cause).is_some())

@@ -37,7 +37,7 @@ pub struct LiveArgs {
     time: Option<Duration>,
 }
 
-/// How often to check whether to go on while nothing arrives.
+/// How often to check whether to continue while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// A device with which the command continues when it is back; errors are shown to the user.

@@ -18,7 +18,7 @@ use crate::interrupt;
 use crate::rescue::Rescue;
 use crate::words::failure_name;
 
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 pub const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// Frames being sent: counts their ends, prints them like candump, and notices when no more can be sent.

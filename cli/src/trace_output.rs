@@ -127,7 +127,7 @@ pub fn named(mut options: WriteOptions, path: &Path) -> anyhow::Result<WriteOpti
 /// Refuses to overwrite what a bus said once and will not say again.
 pub fn refuse_older(path: &Path, force: bool) -> anyhow::Result<()> {
     if path.is_file() && !force {
-        bail!("'{}' is there already; choose another name, or write over it with --force", path.display());
+        bail!("'{}' already exists; choose another name, or overwrite it with --force", path.display());
     }
     Ok(())
 }

@@ -142,7 +142,7 @@ fn whatever_listens_and_hears_only_errors_fails_and_says_why() {
         let told = err.matches("channel 1: only errors and no frame").count();
         assert!(told == 1 && err.contains("cantap autobaud -d virtual"), "{command}: {err}");
     }
-    // One good channel is enough, and silence is no error.
+    // One good channel is enough, and silence is not an error.
     for bus in ["virtual:bitrate=500k,load=50 -b 500k -b 2:250k", "virtual:load=0 -b 500k"] {
         let (code, _, err) = line(&format!("stats -d {bus} -t 400ms"));
         assert!(code == Some(0) && !err.contains("channel 1: only errors"), "{bus}: {err}");

@@ -71,7 +71,7 @@ fn faulty_lines_are_refused_before_anything_is_sent() {
     for (line, code, part) in [
         ("send -d virtual can2 123#", 2, "can0"),
         ("send -d virtual can0 123", 2, "123#DEADBEEF"),
-        ("send -d virtual can0 123#GG", 2, "'123#GG' is no frame"),
+        ("send -d virtual can0 123#GG", 2, "'123#GG' is not a frame"),
         ("send -d virtual can0 800#", 2, "7FF"),
         ("send -d virtual can0 123# --counter 0", 2, "--period"),
         ("send -d virtual can0 123#00 --period 46us", 2, "46µs is too short: no frame is shorter than 47µs"),

@@ -165,7 +165,7 @@ fn a_sheet_names_what_pdos_carry_and_one_that_is_none_is_refused() {
     assert!(out.contains("TPDO1: Statusword 567\n") && out.contains("TPDO1: data 37 02\n"), "{out}");
     assert!(err.contains("drive.eds: line 11: neither a section nor a key: rubbish"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "bus.log"]);
-    assert!(code == Some(1) && err.contains("is no EDS or DCF"), "{err}");
+    assert!(code == Some(1) && err.contains("is not an EDS or DCF"), "{err}");
     let (code, _, err) = cantap("conversations_sheet", log, &["--eds", "200:drive.eds"]);
     assert!(code == Some(2) && err.contains("nodes from 1 to 127"), "{err}");
 }

@@ -89,7 +89,7 @@ fn what_is_wrong_is_named_and_ends_with_1() {
     for (arguments, expected) in [
         (&["--db", "bad.dbc", "trace.log"][..], "cantap: bad.dbc: line 2: M.S: not of the form SG_ NAME"),
         (&["--db", "none.dbc", "trace.log"], "cantap: cannot read database none.dbc: No such file"),
-        (&["--db", "trace.log", "trace.log"], "cantap: trace.log is no known kind of database"),
+        (&["--db", "trace.log", "trace.log"], "cantap: trace.log is not a known kind of database"),
         (&["--db", "body.dbc", "none.log"], "cantap: cannot open none.log"),
         (
             &["--db", "dashboard.toml", "trace.log", "-s", "Sped"],

@@ -98,7 +98,7 @@ fn what_cannot_be_done_says_what_can() {
         ("extcap", 2, "cantap extcap install"),
         ("--extcap-interface cantap-3A --extcap-config", 1, "'cantap-3A' is not connected"),
         ("--extcap-interface cantap-virtual", 2, "--capture --fifo PIPE"),
-        ("--extcap-interface cantap-virtual --extcap-capture-filter tcp", 2, "'tcp' is no filter"),
+        ("--extcap-interface cantap-virtual --extcap-capture-filter tcp", 2, "'tcp' is not a filter"),
         ("--capture --extcap-interface cantap-virtual", 2, "--fifo"),
         ("--capture --extcap-interface cantap-virtual --fifo x --bitrate1 fast", 2, "auto"),
         ("--capture --extcap-interface cantap-virtual --fifo /nowhere/x", 1, "Wireshark makes this pipe"),
@@ -428,7 +428,7 @@ fn tshark_shows_what_a_shared_board_sends_and_where_frames_are_missing() {
     for line in &lost {
         let words: Vec<_> = line.split('|').collect();
         assert!(words[0] == "can0" && ["1", "True"].contains(&words[1]), "{line}");
-        assert_eq!(words[2], "frames were lost here between device and computer, nobody knows how many");
+        assert_eq!(words[2], "an unknown number of frames was lost here between device and computer");
     }
     // And what it wrote is what we read.
     let all = records(&tshark.file());

@@ -178,7 +178,7 @@ fn what_the_device_leaves_out_gives_no_load() {
         (
             out.contains("Load"),
             out.lines().nth(1).unwrap().contains(" %"),
-            out.contains("zeros stand in its place"),
+            out.contains("there are zeros in its place"),
         )
     };
     assert_eq!(load(""), (true, true, false));

@@ -61,7 +61,7 @@ fn a_file_is_played_slower_faster_stopped_and_by_steps_and_left_for_a_device() {
     view.keys(">>");
     view.wait_until("two more", |screen| rows(screen) == before + 2);
     view.keys("p..........");
-    view.wait_for("ended as fast as can be");
+    view.wait_for("ended as fast as possible");
     // It sends nothing, and says what would be needed.
     view.keys("6a123#1122\r\r");
     view.wait_for("a file sends nothing; open a device with D");

@@ -60,7 +60,7 @@ fn what_no_frame_can_say_is_refused_before_anything_is_sent() {
         ("ExampleMessage:Enabel=1", "did you mean Enable"),
         ("ExampleMessage:Enable=1,Enable=0", "given twice"),
         ("ExampleMessage:Enable=2", "does not fit Enable, which goes from 0 to 1"),
-        ("ExampleMessage:Enable=Maybe", "is no value for Enable"),
+        ("ExampleMessage:Enable=Maybe", "is not a value for Enable"),
         ("ExampleMessage:Temperature=300", "does not fit Temperature"),
         ("ExampleMessage:AverageRadius=5.5", "raw:55"),
         ("ExampleMessage:Enable", "write it as Message:Signal=value"),

@@ -516,7 +516,7 @@ fn what_cannot_be_served_is_said_at_once() {
         ("serve -d /dev/nothing -b 500k", 1, "there is no device at '/dev/nothing'"),
         ("serve -d virtual -d virtual --stdio", 2, "--stdio serves one device"),
         ("capture -d tcp://127.0.0.1:9 -b 500k", 1, "there is no server"),
-        ("capture -d ssh://-oProxyCommand=x -b 500k", 2, "is no name of a computer"),
+        ("capture -d ssh://-oProxyCommand=x -b 500k", 2, "is not the name of a computer"),
     ] {
         let (exit, out, err) = run(arguments);
         assert_eq!(exit, Some(code), "{arguments}: {out}{err}");

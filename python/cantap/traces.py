@@ -244,7 +244,7 @@ def _with_our_types(table: Any) -> Any:
                 to = pa.string() if pa.types.is_dictionary(field.type) else field.type
                 columns[field.name] = column.cast(to)
     except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise _native.FormatError(f"the table is no trace: {error}") from error
+        raise _native.FormatError(f"the table is not a trace: {error}") from error
     return pa.table(columns)
 
 

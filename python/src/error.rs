@@ -26,7 +26,7 @@ pyo3::create_exception!(
     cantap,
     FormatError,
     CantapError,
-    "A file is no trace of a format that is read or written."
+    "A file is not a trace in a format that can be read or written."
 );
 pyo3::create_exception!(
     cantap,

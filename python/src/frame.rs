@@ -19,7 +19,7 @@ pub fn identifier(raw: u32, extended: Option<bool>) -> Result<Id, Error> {
     let id = if extended.unwrap_or(raw > Id::MAX_STANDARD) { Id::extended(raw) } else { Id::standard(raw) };
     id.ok_or_else(|| {
         Error::argument(format!(
-            "{raw:#X} is no identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
+            "{raw:#X} is not an identifier; 0x7FF is the last standard one, 0x1FFFFFFF the last extended one"
         ))
     })
 }
@@ -101,7 +101,7 @@ impl Frame {
     #[staticmethod]
     fn parse(text: &str) -> PyResult<Self> {
         let frame = text.parse::<ClassicFrame>();
-        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is no frame: {error}")))
+        frame.map(Self).map_err(|error| PyValueError::new_err(format!("'{text}' is not a frame: {error}")))
     }
 }
 

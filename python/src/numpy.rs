@@ -47,7 +47,7 @@ pub fn parts<'py>(py: Python<'py>, column: &dyn Array) -> Result<Parts<'py>, Err
             };
             Ok((kind, PyBytes::new(py, &bytes), mask, Some(texts), size))
         }
-        other => Err(Error::Format(format!("a column of {other} is none of NumPy's"))),
+        other => Err(Error::Format(format!("a column of {other} is not supported by NumPy"))),
     }
 }
 

@@ -61,7 +61,7 @@ pub fn stats(
         rates.iter().filter_map(|(channel, rate)| Some(((*channel)?, *rate))).collect::<Vec<_>>()
     };
     let window = Duration::try_from_secs_f64(window_s);
-    let window = window.map_err(|_| Error::argument(format!("{window_s} s is no length of a window")))?;
+    let window = window.map_err(|_| Error::argument(format!("{window_s} s is not a valid window length")))?;
     let statistics = Statistics::new(StatOptions {
         bitrate_bps: all(&bitrates),
         channel_bitrate_bps: of_channels(&bitrates),

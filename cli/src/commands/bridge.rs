@@ -50,7 +50,7 @@ pub struct Args {
     open: ChannelArgs,
 }
 
-/// How often to check whether to go on while nothing arrives.
+/// How often to check whether to continue while nothing arrives.
 const LOOK_EVERY: Duration = Duration::from_millis(50);
 
 /// A device used by both directions.

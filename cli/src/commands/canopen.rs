@@ -188,7 +188,7 @@ fn nmt(speak: &SpeakArgs, node: u8, command: Command, sheets: Vec<Sheet>) -> any
     if !is_heard {
         let state = state_name(becomes).unwrap_or_default();
         eprintln!(
-            "cantap: the command was sent and acknowledged; no node told a new state within {} s, so whether it is {state} is not known",
+            "cantap: the command was sent and acknowledged; no node reported a new state within {} s, so it is unknown whether it is {state}",
             OBEYS.as_secs()
         );
     }

@@ -113,7 +113,7 @@ enum ModeArg {
 struct Filters(Vec<Filter>);
 
 fn filters(text: &str) -> Result<Filters, String> {
-    let parse = |word: &str| word.parse().map_err(|error| format!("'{word}' is no filter: {error}"));
+    let parse = |word: &str| word.parse().map_err(|error| format!("'{word}' is not a filter: {error}"));
     text.split_whitespace().map(parse).collect::<Result<_, _>>().map(Filters)
 }
 
@@ -210,6 +210,6 @@ mod tests {
     fn a_capture_filter_is_several_of_candumps() {
         assert_eq!(filters("").unwrap().0.len(), 0);
         assert_eq!(filters("can0,123:7FF  #FF").unwrap().0.len(), 2);
-        assert!(filters("tcp port 80").unwrap_err().starts_with("'tcp' is no filter"));
+        assert!(filters("tcp port 80").unwrap_err().starts_with("'tcp' is not a filter"));
     }
 }

@@ -81,7 +81,7 @@ struct Server {
 pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     if matches!(args.what, Some(What::Clear { yes: false })) {
         return Err(wrong(
-            "clearing erases what the workshop needs to find the fault, and readiness tests start anew; if that is meant, add --yes",
+            "clearing erases what the workshop needs to find the fault, and readiness tests start over; to go ahead, add --yes",
         ));
     }
     let device = args.speak.open()?;

@@ -154,7 +154,7 @@ impl Args {
                 Ok(cantap_signals::encode::encode(&database, Some(self.channel.number()), text)?.frame)
             } else {
                 let frame = text.parse::<Frame>();
-                Ok(frame.map_err(|error| wrong(format!("'{text}' is no frame: {error}")))?)
+                Ok(frame.map_err(|error| wrong(format!("'{text}' is not a frame: {error}")))?)
             }
         };
         let frames = self.frames.iter().map(frame).collect::<anyhow::Result<_>>()?;

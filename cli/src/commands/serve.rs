@@ -193,7 +193,7 @@ fn check_bitrates(args: &Args, number: usize, board: &Board) -> anyhow::Result<(
 
 /// An address, a port of this computer, or both.
 fn address(text: &str, port: u16) -> anyhow::Result<SocketAddr> {
-    let not_one = || wrong(format!("'{text}' is no address to listen at; write it as 127.0.0.1:{port}"));
+    let not_one = || wrong(format!("'{text}' is not an address to listen at; write it as 127.0.0.1:{port}"));
     let address: SocketAddr = match text.parse() {
         Ok(address) => address,
         Err(_) => match (text.parse(), text.parse()) {
@@ -347,7 +347,9 @@ impl Beside {
             })?;
             let address = way.address().unwrap_or(address);
             if !address.ip().is_loopback() {
-                stderr::warn(&format!("whoever reaches {address} can hear the buses; nobody can send there"));
+                stderr::warn(&format!(
+                    "anyone who reaches {address} can listen to the buses; nobody can send there"
+                ));
             }
             ways.push((format!("can://{address}"), way));
         }

@@ -109,7 +109,7 @@ fn check_image(image: &[u8]) -> anyhow::Result<()> {
     let in_ram = matches!(stack >> 24, 0x10 | 0x20);
     let in_flash = reset & 1 == 1 && (FLASH_START..FLASH_START + MAX_IMAGE as u32).contains(&reset);
     if !in_ram || !in_flash || image.len() as u64 > MAX_IMAGE {
-        bail!("it is no firmware image for this chip; give the .bin that `cargo xtask dist` makes");
+        bail!("it is not a firmware image for this chip; give the .bin that `cargo xtask dist` makes");
     }
     Ok(())
 }

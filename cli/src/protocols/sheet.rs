@@ -37,7 +37,7 @@ impl SheetPath {
         let eds = Eds::parse(&bytes);
         anyhow::ensure!(
             !eds.objects.is_empty(),
-            "{name} is no EDS or DCF: there is no object in it; give the file that came with the device"
+            "{name} is not an EDS or DCF: there is no object in it; give the file that came with the device"
         );
         if !quiet {
             for issue in &eds.issues {

@@ -355,7 +355,7 @@ struct Heard {
     end: Option<SessionOver>,
 }
 
-/// Takes bytes from the board: records go to the clients, answers to whoever sent the request.
+/// Takes bytes from the board: records go to the clients, answers to the client that sent the request.
 fn take(state: &mut State, decoder: &mut Decoder, piece: &[u8], heard: &mut Heard) {
     let mut chunk: Vec<Entry> = Vec::new();
     decoder.push(piece, |decoded| match decoded {

@@ -1,4 +1,4 @@
-//! What a server reports to whoever runs it.
+//! What a server reports to the program that runs it.
 
 use std::fmt;
 

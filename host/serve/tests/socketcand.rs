@@ -167,7 +167,7 @@ fn bcm_mode_sends_again_and_again_by_the_board_s_clock_and_tells_what_was_subscr
     assert_eq!(timeless(&client.one()), "error 20000004 83 01 00 00 00 00 00 00  >");
     let heard: Vec<String> = (0..4).map(|_| timeless(&client.one())).collect();
     assert_eq!(heard, ["frame 123 11  >", "frame 124 11  >", "frame 124 21  >", "rtr 123 0 >"]);
-    assert_eq!(client.ask("< delete 200 >"), "< error nothing is sent again and again as 200 >");
+    assert_eq!(client.ask("< delete 200 >"), "< error nothing is sent periodically as 200 >");
     assert_eq!(client.ask("< add 1000 0 200 0 >"), "< error the board's longest period is 357 s >");
     assert_eq!(client.ask("< send 123 2 11 >"), "< error the number of bytes is wrong in 'send 123 2 11' >");
 }

@@ -277,7 +277,7 @@ fn keys_are_secret_and_nothing_is_overwritten() {
         use std::os::unix::fs::PermissionsExt;
         assert_eq!(std::fs::metadata(key).unwrap().permissions().mode() & 0o777, 0o600);
     }
-    assert!(keys.add_client("alice", Role::Send).unwrap_err().to_string().contains("is there already"));
+    assert!(keys.add_client("alice", Role::Send).unwrap_err().to_string().contains("already exists"));
     for name in ["", "../x", "a b", "ca-key"] {
         assert!(keys.add_client(name, Role::Listen).is_err(), "{name}");
     }

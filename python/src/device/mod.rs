@@ -161,7 +161,7 @@ impl Device {
             let found = MODES.iter().find(|(_, name)| *name == options.mode);
             let Some((mode, _)) = found else {
                 let words = format!(
-                    "'{}' is no mode; there are listen-only, normal, loopback and silent-loopback",
+                    "'{}' is not a mode; there are listen-only, normal, loopback and silent-loopback",
                     options.mode
                 );
                 return Err(Error::argument(words));
@@ -256,7 +256,7 @@ impl Device {
         let frames: Vec<ClassicFrame> = frames.into_iter().map(|frame| frame.0).collect();
         let seconds = timeout.unwrap_or(queue_timeout);
         let patience = Duration::try_from_secs_f64(seconds)
-            .map_err(|_| PyValueError::new_err(format!("{seconds} s is no time to wait")))?
+            .map_err(|_| PyValueError::new_err(format!("{seconds} s is not a valid time to wait")))?
             .min(MOST_TIME);
         let ended = py.detach(|| -> Result<_, Error> {
             let device = session.device()?;

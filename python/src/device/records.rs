@@ -44,7 +44,7 @@ impl Until {
     pub fn of(timeout: Option<f64>) -> Result<Self, Error> {
         let Some(seconds) = timeout else { return Ok(Self(None)) };
         let time = Duration::try_from_secs_f64(seconds.max(0.0));
-        let time = time.map_err(|_| Error::argument(format!("{seconds} s is no time to wait")))?;
+        let time = time.map_err(|_| Error::argument(format!("{seconds} s is not a valid time to wait")))?;
         Ok(Self(Instant::now().checked_add(time)))
     }
 

@@ -31,7 +31,7 @@ fn modifier((kind, byte, low_bit, bits, algorithm): &ModifierWords) -> Result<Mo
                 "sum" => Checksum::Sum,
                 "crc8-j1850" => Checksum::Crc8J1850,
                 other => {
-                    let words = format!("'{other}' is no checksum; there are xor, sum and crc8-j1850");
+                    let words = format!("'{other}' is not a checksum; there are xor, sum and crc8-j1850");
                     return Err(Error::argument(words));
                 }
             };
@@ -93,7 +93,7 @@ impl PeriodicFrame {
         modifiers: &[ModifierWords],
     ) -> Result<Self, Error> {
         let period = Duration::try_from_secs_f64(period_s)
-            .map_err(|_| Error::argument(format!("{period_s} s is no period")))?;
+            .map_err(|_| Error::argument(format!("{period_s} s is not a valid period")))?;
         let ticks = period_ticks(period, session.device()?.hello().tick_hz).map_err(Error::argument)?;
         let list = modifiers.iter().map(modifier).collect::<Result<Vec<_>, _>>()?;
         check_modifiers(&frame, &list).map_err(Error::argument)?;

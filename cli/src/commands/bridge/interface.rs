@@ -83,7 +83,7 @@ fn look(network: &Path, name: &str) -> anyhow::Result<Known> {
         );
     }
     if read("type") != TYPE_OF_CAN {
-        bail!("'{name}' is no CAN interface; as root: ip link add can0 type vcan && ip link set can0 up");
+        bail!("'{name}' is not a CAN interface; as root: ip link add can0 type vcan && ip link set can0 up");
     }
     let flags = u32::from_str_radix(read("flags").trim_start_matches("0x"), 16).unwrap_or(0);
     // The ends of a vxcan pair name each other.

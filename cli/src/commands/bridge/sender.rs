@@ -25,7 +25,7 @@ use crate::{advice, stderr};
 const CONFIRM_EVERY: Duration = Duration::from_millis(2);
 /// A thread that is not waiting for anything follows a change within this many milliseconds.
 const FOLLOWS_IN_MS: u32 = 500;
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// The thread that sends.
@@ -180,7 +180,7 @@ fn run(shared: &Shared, lanes: &[Lane]) -> io::Result<()> {
             }
             Err(Ended::Device(error)) => {
                 stderr::warn(&format!(
-                    "frames of programs were not sent, or nobody knows: {}",
+                    "programs' frames were not sent, or it is unknown whether they were: {}",
                     advice::sentence(&error.into())
                 ));
             }

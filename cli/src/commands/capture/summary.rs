@@ -133,7 +133,7 @@ impl Summary {
         eprintln!("lost: {}", self.lost.line());
         if let Some(GapSummary { count, seconds }) = &self.gaps {
             eprintln!(
-                "gaps: {count}, {seconds} s in which the device was not there: what was on the bus then nobody counted"
+                "gaps: {count}, {seconds} s in which the device was not there: frames on the bus at that time were not counted"
             );
         }
         if let Some(ppm) = self.clock_drift_ppm {

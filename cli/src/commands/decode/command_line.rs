@@ -24,7 +24,7 @@ use crate::protocols::ProtocolArgs;
     cantap decode --db car.dbc -d /dev/ttyACM0 -b 500k\n  \
     cantap decode workshop.log --protocols --csv\n\n\
 JSON lines are {\"time_s\", \"channel\", \"id\", \"message\", \"signals\": {NAME: NUMBER}}:\nseconds, channel from 1, \
-    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is no number, or J1939's error or not available).\n\
+    identifier in hexadecimal (3 or 8 digits),\nphysical values (null where there is none: a float that is not a number, or J1939's error or not available).\n\
 With --details each signal is {\"value\", \"unit\", \"text\", \"raw\"}, without those that it does not have.\n\
 With --protocols, what was said has also protocol, from and to.\n\
 The last line is {\"summary\"}: how much there was, was decoded, and could not be read.")]

@@ -29,14 +29,14 @@ const FLUSH_EVERY: Duration = Duration::from_millis(5);
 /// and discards everything beyond 1000 packets (its option -N, which tshark and Wireshark do not pass on).
 const MOST_AT_ONCE: usize = 250;
 const PAUSE: Duration = Duration::from_millis(1);
-/// How often Wireshark is told how many frames each channel has had and lost. A reader that is gone is noticed by then at the
-/// latest.
+/// How often Wireshark is told how many frames each channel has had and lost. A reader that is gone is noticed within that
+/// time.
 const STATISTICS_EVERY: Duration = Duration::from_secs(1);
 /// Wireshark opens its pipe within this time, or never.
 const PIPE_PATIENCE: Duration = Duration::from_secs(30);
 /// After a failure, it opens it within this time.
 const GRACE: Duration = Duration::from_secs(3);
-/// This long after the request to end, the program ends even if nobody reads its last messages, and with it the board falls
+/// The program ends this long after the request to end, even if nobody reads its last messages, and with it the board falls
 /// silent.
 const LAST_WORDS: Duration = Duration::from_secs(3);
 

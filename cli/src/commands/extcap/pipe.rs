@@ -10,7 +10,7 @@ use anyhow::Context;
 
 use crate::interrupt;
 
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// A pipe being opened, which waits until somebody reads it.

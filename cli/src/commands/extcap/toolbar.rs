@@ -53,13 +53,13 @@ impl Control {
     pub const fn description(self) -> &'static str {
         match self {
             Self::BitRate1 => {
-                "{type=selector}{display=Channel 1}{tooltip=Bit rate; changing it opens the channel anew}"
+                "{type=selector}{display=Channel 1}{tooltip=Bit rate; changing it reopens the channel}"
             }
             Self::BitRate2 => {
-                "{type=selector}{display=Channel 2}{tooltip=Bit rate; changing it opens the channel anew}"
+                "{type=selector}{display=Channel 2}{tooltip=Bit rate; changing it reopens the channel}"
             }
             Self::Mode => {
-                "{type=selector}{display=Mode}{tooltip=How both channels take part; changing it opens them anew}"
+                "{type=selector}{display=Mode}{tooltip=How both channels take part; changing it reopens them}"
             }
             Self::Load => "{type=string}{display=Load}{tooltip=Bus load of each channel in the last second}",
             Self::Lost => {

@@ -121,7 +121,7 @@ pub fn fill_queue(device: &Device, channel: Channel) -> Result {
     // Mailboxes take a few more than the queue.
     let holds = refused && queued >= places && told == queued;
     let says = format!(
-        "{queued} frames taken (the queue has {places}), then refused; {told} told as taken back, in order"
+        "{queued} frames taken (the queue has {places}), then refused; {told} reported as withdrawn, in order"
     );
     Ok(Outcome::of(holds, says, json!({ "queued": queued, "refused": refused, "told": told })))
 }

@@ -68,7 +68,7 @@ fn make(folder: &Path, hosts: &[String], clients: &[(String, Role)]) -> anyhow::
         writeln!(out, "{}", files.key.display())?;
     }
     eprintln!(
-        "cantap: give each client its two files and ca.pem; whoever has ca-key.pem can make clients: keep it where nobody \
+        "cantap: give each client its two files and ca.pem; anyone who has ca-key.pem can make clients: keep it where nobody \
          gets at it"
     );
     Ok(ExitCode::SUCCESS)

@@ -63,7 +63,7 @@ fn key(command: &str, seed: &[u8]) -> anyhow::Result<Vec<u8>> {
         Ok(Hex(key)) => Ok(key),
         Err(_) => {
             bail!(
-                "--key-command '{command}' printed '{}', which is no key in hexadecimal; no key was sent",
+                "--key-command '{command}' printed '{}', which is not a key in hexadecimal; no key was sent",
                 text.trim()
             )
         }

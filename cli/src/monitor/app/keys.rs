@@ -206,7 +206,8 @@ impl App {
     fn copy(&mut self, model: &Model) {
         let place = self.cursor.or(model.history.end().checked_sub(1));
         self.clipboard = place.and_then(|place| candump_line(&model.history.get(place)?));
-        let said = if self.clipboard.is_some() { "copied" } else { "this is no frame; nothing was copied" };
+        let said =
+            if self.clipboard.is_some() { "copied" } else { "this is not a frame; nothing was copied" };
         said.clone_into(&mut self.message);
     }
 

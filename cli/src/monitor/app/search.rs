@@ -73,7 +73,7 @@ impl App {
         });
         match steps.into_iter().find(|place| rows[*place].to_uppercase().contains(&self.wanted)) {
             Some(place) => self.selected = place,
-            None => self.message = format!("'{}' is not there", self.wanted),
+            None => self.message = format!("'{}' was not found", self.wanted),
         }
     }
 
@@ -109,7 +109,7 @@ impl App {
                 self.search = Some(Search { at, ..search });
                 self.message = format!("looking for '{}'; any key stops", self.wanted);
             }
-            (None, None) => self.message = format!("'{}' is not there", self.wanted),
+            (None, None) => self.message = format!("'{}' was not found", self.wanted),
         }
     }
 }

@@ -150,7 +150,7 @@ impl Condition {
             Some((name, comparison, value)) => {
                 let number = value.parse::<f64>().ok().filter(|number| number.is_finite());
                 let number = number.ok_or_else(|| {
-                    format!("'{value}' is no number; write part of a name, a condition such as Speed > 80, or alarm")
+                    format!("'{value}' is not a number; write part of a name, a condition such as Speed > 80, or alarm")
                 })?;
                 (name, Some((comparison, number)))
             }

@@ -217,7 +217,7 @@ impl Source<'_> {
         let without_load: Vec<u8> =
             lacks(|config| config.omit_data || config.omit_stamps).map(|(number, ..)| *number).collect();
         if lacks(|config| config.omit_data).next().is_some() && model.notice.is_empty() {
-            "the device leaves data out: zeros stand in its place, and the load is not known"
+            "the device leaves data out: there are zeros in its place, and the load is unknown"
                 .clone_into(&mut model.notice);
         }
         if without_load != model.options().without_load

@@ -51,7 +51,7 @@ fn a_search_finds_older_and_newer_frames_by_bytes_and_by_name() {
     let record = model.history.get(app.cursor.unwrap()).unwrap();
     assert_eq!(record.frame().unwrap().id().to_string(), "09F80102");
     press(&mut app, &mut model, "/7FF#1234\n");
-    assert_eq!(app.message, "'7FF#1234' is not there");
+    assert_eq!(app.message, "'7FF#1234' was not found");
     press(&mut app, &mut model, "y");
     assert!(app.clipboard.unwrap().contains("can0 09F80102#"));
 }
@@ -85,7 +85,7 @@ fn a_long_search_goes_on_between_drawings_and_can_be_stopped() {
     for _ in 0..5 {
         app.catch_up(&mut model);
     }
-    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' is not there"));
+    assert_eq!((app.cursor, app.message.as_str()), (Some(1001), "'7AB' was not found"));
 }
 
 #[test]

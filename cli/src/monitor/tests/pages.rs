@@ -68,7 +68,7 @@ fn signals_are_searched_grouped_sorted_and_narrowed() {
     press(&mut app, &mut model, "N");
     assert_eq!(app.selected, 0);
     press(&mut app, &mut model, "/nothing\n");
-    assert_eq!((app.selected, app.message.as_str()), (0, "'NOTHING' is not there"));
+    assert_eq!((app.selected, app.message.as_str()), (0, "'NOTHING' was not found"));
     press(&mut app, &mut model, "s");
     assert_eq!(names(&mut app, &model), ["Body.Door", "Engine.OilTemp", "Engine.Speed"]);
     // Clicks on headings sort; a second click reverses the order.

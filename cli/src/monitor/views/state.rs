@@ -202,7 +202,7 @@ fn playing_text(playing: Playing) -> String {
     };
     // The engine's factor is the delay: above 1, speed is its inverse.
     let speed = match playing.factor {
-        0.0 => "as fast as can be".to_owned(),
+        0.0 => "as fast as possible".to_owned(),
         factor => format!("×{}", (1e4 / factor).round() / 1e4),
     };
     let at = duration(playing.position_ns.saturating_sub(playing.first_ns));

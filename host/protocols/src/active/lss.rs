@@ -68,7 +68,7 @@ const fn refusal(command: u8, error: u8) -> &'static str {
         (0x13, 1) => "it has no such bit rate",
         (0x17, 1) => "it cannot store",
         (0x17, 2) => "it cannot reach its storage",
-        (_, 0xFF) => "a reason of its own",
+        (_, 0xFF) => "a reason specific to the manufacturer",
         _ => "a reserved reason",
     }
 }

@@ -157,7 +157,7 @@ impl Eds {
     fn entry(&mut self, name: &str, section: &Section) -> Entry {
         let data_type = section.number("datatype").and_then(|kind| u16::try_from(kind).ok());
         if data_type.is_none() && section.keys.contains_key("datatype") {
-            self.issues.push(format!("line {}: the data type of [{name}] is no number", section.line));
+            self.issues.push(format!("line {}: the data type of [{name}] is not a number", section.line));
         }
         let set = section.keys.get("parametervalue").filter(|value| !value.is_empty());
         Entry {
@@ -213,7 +213,7 @@ impl Eds {
         let Some((object, sub)) = name.split_once("sub") else { return };
         let Some(index) = index(object) else { return };
         let Ok(sub) = u8::from_str_radix(sub, 16) else {
-            self.issues.push(format!("line {}: [{name}] is no sub-index", section.line));
+            self.issues.push(format!("line {}: [{name}] is not a sub-index", section.line));
             return;
         };
         let entry = self.entry(name, section);
@@ -252,7 +252,7 @@ impl Eds {
             match number(value, 0).and_then(|index| u16::try_from(index).ok()) {
                 Some(index) if self.objects.contains_key(&index) => {}
                 Some(index) => self.issues.push(format!("[{list}] names {index:04X}, which has no section")),
-                None => self.issues.push(format!("[{list}] names '{value}', which is no index")),
+                None => self.issues.push(format!("[{list}] names '{value}', which is not an index")),
             }
         }
         if count != found {

@@ -2,7 +2,7 @@
 
 /// A text that is not a value of the type.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{text}' is no {name}; write {advice}")]
+#[error("'{text}' is not a valid {name}; write {advice}")]
 pub struct BadValue {
     /// The text.
     pub text: String,
@@ -152,7 +152,7 @@ mod tests {
         }
         assert_eq!(
             encode(0x05, "256").unwrap_err().to_string(),
-            "'256' is no u8; write a number within the type's range"
+            "'256' is not a valid u8; write a number within the type's range"
         );
         assert_eq!(type_named("byte"), None);
     }

@@ -32,7 +32,7 @@ pub struct Pair {
 /// A text that is not a pair.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "'{0}' is no pair; write two identifiers, as 7E0:7E8, or 6F1/12:612/F1 where the first data byte is an address"
+    "'{0}' is not a pair; write two identifiers, as 7E0:7E8, or 6F1/12:612/F1 where the first data byte is an address"
 )]
 pub struct BadPair(String);
 

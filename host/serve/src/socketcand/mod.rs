@@ -317,14 +317,14 @@ impl Connection {
                     let us = *us;
                     self.add(bus, us, frame)
                 }
-                None => Err(format!("nothing is sent again and again as {}", frame.id())),
+                None => Err(format!("nothing is sent periodically as {}", frame.id())),
             },
             Command::Delete(id) => match bus.periodic.remove(&id) {
                 Some((slot, _)) => {
                     lock(&self.hearing).own_entries.remove(&id);
                     bus.device.set_periodic(bus.channel, slot, None).map_err(|error| error.to_string())
                 }
-                None => Err(format!("nothing is sent again and again as {id}")),
+                None => Err(format!("nothing is sent periodically as {id}")),
             },
         };
         let reason = done.err()?;
@@ -456,7 +456,7 @@ impl Connection {
             None => (0..hello.periodic_slots)
                 .find(|slot| bus.periodic.values().all(|(taken, _)| taken != slot))
                 .ok_or_else(|| {
-                    format!("the board sends {} frames again and again at most", hello.periodic_slots)
+                    format!("the board sends at most {} frames periodically", hello.periodic_slots)
                 })?,
         };
         let entry = Periodic { frame, period_ticks, count: 0, modifiers: heapless::Vec::new() };

@@ -23,10 +23,10 @@ const AUTHORITY: &str = "ca";
 #[derive(Debug, thiserror::Error)]
 pub enum KeysError {
     /// The name cannot be used for files.
-    #[error("'{0}' is no name for a key; use letters, digits, - and _")]
+    #[error("'{0}' is not a name for a key; use letters, digits, - and _")]
     Name(String),
     /// The file exists; nothing is overwritten.
-    #[error("'{}' is there already; choose another name, or another folder", .0.display())]
+    #[error("'{}' already exists; choose another name, or another folder", .0.display())]
     There(PathBuf),
     /// A file could not be written or read.
     #[error("'{}': {source}", path.display())]

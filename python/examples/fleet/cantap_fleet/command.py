@@ -26,7 +26,7 @@ _UNITS = {"": 1, "k": 1 << 10, "m": 1 << 20, "g": 1 << 30}
 def _bytes(text: str) -> int:
     found = re.fullmatch(r"(\d+)([kmg]?)", text.lower())
     if not found or int(found[1]) == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no size; write 64M or 2G")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size; write 64M or 2G")
     return int(found[1]) * _UNITS[found[2]]
 
 
@@ -36,7 +36,7 @@ def _seconds(text: str) -> float:
     except ValueError:
         seconds = 0.0
     if not 0 < seconds < 1e9:
-        raise argparse.ArgumentTypeError(f"'{text}' is no time; give seconds, more than 0")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a time; give seconds, more than 0")
     return seconds
 
 
@@ -47,7 +47,7 @@ def _number(text: str) -> tuple[str, float]:
     try:
         return name, float(value)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"'{text}' is no number; write {name}=80") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number; write {name}=80") from None
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -167,7 +167,7 @@ fn device_care_is_one_line_each() {
         assert_eq!(cantap(line), (Some(0), out.to_owned(), String::new()), "{line}");
     }
     let (code, _, err) = cantap("update -d virtual Cargo.toml");
-    assert!(code == Some(1) && err.contains("no firmware image"), "{err}");
+    assert!(code == Some(1) && err.contains("not a firmware image"), "{err}");
 }
 
 #[test]

@@ -76,7 +76,7 @@ fn what_is_no_image_never_brings_the_device_out_of_its_firmware() {
     for (content, part) in [
         (b"\x7FELF and more".as_slice(), "ELF"),
         (b"short", "too short"),
-        (b"a text that is long enough to have two words", "no firmware image"),
+        (b"a text that is long enough to have two words", "not a firmware image"),
     ] {
         std::fs::write(&other, content).unwrap();
         // There is no such device: an attempt to open it would be reported first.

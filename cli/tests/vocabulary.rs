@@ -152,10 +152,10 @@ fn the_same_mistake_has_the_same_words_and_exit_code_everywhere() {
     }
     // An existing file is not lost by a slip.
     let (code, _, err) = cantap(&format!("capture -d virtual -b 500k -n 5 -o {there}"));
-    assert!(code == Some(1) && err.contains("there already"), "{err}");
+    assert!(code == Some(1) && err.contains("already exists"), "{err}");
     assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
     let (code, _, err) = cantap(&format!("monitor -d virtual -b 500k --once -o {there}"));
-    assert!(code == Some(1) && err.contains("there already"), "{err}");
+    assert!(code == Some(1) && err.contains("already exists"), "{err}");
     assert_eq!(std::fs::read_to_string(folder.path().join("there.log")).unwrap(), "kept");
     for command in ["capture -d virtual -b 500k -n 5", "monitor -d virtual -b 500k --once -t 100ms"] {
         let (code, _, err) = cantap(&format!("{command} -o {there} --force"));

@@ -78,7 +78,7 @@ fn traces_without_a_common_bus_are_refused_and_nothing_is_written() {
     std::fs::write(folder.join("b.log"), log("can0", 0..3_000, 0.0, 0.0, 0xFFFF_0000)).unwrap();
     let (code, out, err) = cantap(&folder, &["align", "a.log", "b.log", "-o", "none.log"]);
     assert_eq!((code, out.as_str()), (Some(1), ""));
-    assert!(err.starts_with("cantap: a.log and b.log cannot be aligned: no stretch"), "{err}");
+    assert!(err.starts_with("cantap: a.log and b.log cannot be aligned: no part"), "{err}");
     assert!(!folder.join("none.log").exists());
 }
 

@@ -214,7 +214,7 @@ mod tests {
             ("down", "ip link set down up"),
             ("slcan0", "belongs to a CAN controller"),
             ("can0", "belongs to a CAN controller"),
-            ("lo", "no CAN interface"),
+            ("lo", "not a CAN interface"),
             ("../x", "no interface"),
         ] {
             let error = look(name).unwrap_err();

@@ -1,7 +1,10 @@
 //! One board and eight clients on two saturated channels: what the server takes, what it adds, and whether each client has everything or
 //! its loss counted.
 
-use std::io::{BufRead, BufReader, Read};
+#[path = "../../../host/serve/tests/line/mod.rs"]
+mod line;
+
+use std::io::{BufRead, BufReader};
 use std::os::unix::net::UnixStream;
 use std::path::Path;
 use std::process::{Child, Command, Stdio};
@@ -11,6 +14,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use anyhow::{Context, Result, ensure};
 use cantap::device::{ChannelCounters, Device, Link};
 use cantap_wire::Channel;
+use line::SlowLine;
 use xshell::cmd;
 
 use crate::workspace;
@@ -100,31 +104,13 @@ fn listen(device: &Device, is_over: &AtomicBool) -> Result<Outcome> {
     Ok(Outcome { channels: device.counters().channels, ages })
 }
 
-/// A line that carries so many bytes in a second.
-struct SlowLine {
-    stream: UnixStream,
-    began: Instant,
-    taken: usize,
-}
-
-impl Read for SlowLine {
-    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
-        let due = self.began + Duration::from_secs_f64(self.taken as f64 / SLOW_BYTES_PER_S as f64);
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        let most = out.len().min(SLOW_BYTES_PER_S / 50);
-        let len = self.stream.read(&mut out[..most])?;
-        self.taken += len;
-        Ok(len)
-    }
-}
-
 fn client(socket: &str, name: &str, is_slow: bool) -> Result<Device> {
     let stream = UnixStream::connect(socket)?;
     stream.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     stream.set_write_timeout(Some(SOCKET_TIMEOUT))?;
     let writer = stream.try_clone()?;
     let link = if is_slow {
-        Link::new(SlowLine { stream, began: Instant::now(), taken: 0 }, writer)
+        Link::new(SlowLine::new(stream, SLOW_BYTES_PER_S), writer)
     } else {
         Link::new(stream, writer)
     };

@@ -96,9 +96,7 @@ impl Lines {
             eprintln!("{}", line(window, self.colour));
         }
     }
-}
 
-impl Lines {
     /// The window in which listening ended is cut short: channels end a little after one another, and errors of before it are counted in
     /// it, so that its rates would say of a steady bus that it was not. It is shown where it is all there is.
     fn is_worth_a_line(&mut self, window: &Window) -> bool {

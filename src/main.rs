@@ -185,7 +185,7 @@ mod app {
 
     /// Stamps the end of a transmission on CAN1, and leaves the mailbox to [`can1_sent`].
     ///
-    /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp is as good as a frame's.
+    /// Priority 5, as [`can1_rx0`] and for the same reason: a confirmation's stamp must be as good as a frame's.
     #[task(binds = CAN1_TX, priority = 5, shared = [&stamp, &can1_bells, &can1_sent_at])]
     fn can1_tx(cx: can1_tx::Context) {
         cx.shared.can1_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);

@@ -23,7 +23,7 @@ struct Package {
     rust_version: String,
 }
 
-/// Compiles everything with that compiler. Where it is the one that does the other steps, they are the check.
+/// Compiles everything with that compiler. If the other steps already use that compiler, they are the check.
 pub fn check(shell: &Shell) -> Result<Outcome> {
     let manifest: Manifest = toml::from_str(&shell.read_file("Cargo.toml")?).context("Cargo.toml")?;
     let oldest = manifest.workspace.package.rust_version;

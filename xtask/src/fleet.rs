@@ -7,7 +7,7 @@ use xshell::{Shell, cmd};
 
 use crate::{peers, toolchain, workspace};
 
-/// Spark (430 MB, kept in `target/spark`) and what the job and its tests need beside it.
+/// Spark (430 MB, kept in `target/spark`) and what else the job and its tests need.
 const REQUIREMENTS: &str = "python/examples/fleet/requirements.txt";
 /// What Spark runs on.
 const JAVA: &str = "openjdk-17-jre-headless";
@@ -28,7 +28,7 @@ pub fn check(shell: &Shell, wheel: &Path) -> Result<()> {
     let fleet = "python/examples/fleet";
     cmd!(shell, "{python} -m mypy --config-file {fleet}/mypy.ini {fleet}/job.py {fleet}/cantap_fleet")
         .run()?;
-    // As the tests' step leaves it; without it one test says that it was skipped.
+    // Built by the tests' step; without it one test says that it was skipped.
     let command = workspace::target().join("debug/cantap");
     let named = command.exists().then_some(("CANTAP_COMMAND", command));
     cmd!(shell, "{python} -m pytest --quiet python/tests/test_fleet.py").envs(named).run()?;

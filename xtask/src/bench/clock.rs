@@ -12,9 +12,9 @@ mod measure;
 
 use measure::Errors;
 
-/// What the two crystals are off.
+/// By how much the two crystals are off, in ppm.
 const PPM: [f64; 2] = [40.0, -40.0];
-/// Emulated seconds, and from when on errors count.
+/// Emulated seconds, and the second from which errors count.
 const SECONDS: u32 = 300;
 const SETTLED_S: [u32; 2] = [5, 60];
 

@@ -20,12 +20,12 @@ pub const KINDS: [Kind; 4] = [
 
 /// A kind of frames.
 pub struct Kind {
-    /// As `cantap demo` calls it.
+    /// Its name in `cantap demo`.
     pub name: &'static str,
     extended: bool,
     len: usize,
     ticks: i64,
-    /// Most bytes per frame that the design allows (for ext0, that of ext8 less its data).
+    /// Most bytes per frame that the design allows (for ext0, that of ext8 minus its data).
     budget: f64,
 }
 
@@ -45,7 +45,7 @@ pub fn run() -> Result<()> {
     Ok(())
 }
 
-/// Encodes frames of a kind as the device does, and hands over each batch as it goes over the wire.
+/// Encodes frames of a kind as the device does, and passes on each batch as it goes over the wire.
 pub fn encode(kind: &Kind, frames: u64, mut batch: impl FnMut(&[u8])) {
     let mut writer = BatchWriter::new();
     let mut out = [0; MAX_ENCODED];

@@ -38,10 +38,10 @@ pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     Ok(())
 }
 
-/// The bytes that go to the start of the flash, as `dfu-util` wants them.
+/// The flash's contents from its start, in the form that `dfu-util` expects.
 fn flash_image(bytes: &[u8]) -> Result<Vec<u8>> {
     const FLASH_START: usize = 0x0800_0000;
-    /// The flash's size: nothing may lie behind it.
+    /// The flash's size: nothing may lie beyond it.
     const FLASH_LEN: usize = 1 << 20;
 
     let file = ElfFile32::<Endianness>::parse(bytes)?;

@@ -1,4 +1,5 @@
-//! `cargo xtask dist`: what a release has, in `target/dist`, named by what it is and its version.
+//! `cargo xtask dist`: builds a release's files in `target/dist`, each named by its content and
+//! version.
 
 mod archive;
 mod command;
@@ -10,10 +11,10 @@ use anyhow::Result;
 
 use crate::{python, workspace};
 
-/// What `cargo xtask dist` takes.
+/// The arguments of `cargo xtask dist`.
 #[derive(clap::Args)]
 pub struct Args {
-    /// What to make; everything without it.
+    /// What to make; everything if not given.
     what: Vec<What>,
 }
 

@@ -1,4 +1,4 @@
-//! Back from columns to records.
+//! Converts columns back to records.
 
 use arrow_array::cast::AsArray;
 use arrow_array::types::{
@@ -13,26 +13,26 @@ use cantap_wire::record::TransmitFailure;
 use crate::events::{BUS_ERROR, LOST, STATE, SUPPRESSED, TRANSMIT_FAILED};
 use crate::frames::{FRAME, RX, TX};
 
-/// Columns that are no trace.
+/// Why columns are not a trace.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum BadColumns {
-    /// A column is missing or of another type.
+    /// A column is missing or has another type.
     #[error("a trace has a column '{column}' of type {wanted}; {found}")]
     Column {
         /// Its name.
         column: &'static str,
-        /// The type that it should have.
+        /// The required type.
         wanted: &'static str,
-        /// What there is instead.
+        /// What was found instead.
         found: String,
     },
-    /// A row says nothing that a trace could hold.
+    /// A row contains something that a trace cannot hold.
     #[error("row {row} is no {what}")]
     Row {
-        /// The row in its batch, from 0.
+        /// The row's index in its batch, from 0.
         row: usize,
-        /// What it should be.
+        /// What was expected.
         what: &'static str,
     },
     /// The file cannot be read.
@@ -40,8 +40,8 @@ pub enum BadColumns {
     Arrow(#[from] ArrowError),
 }
 
-/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and among others. Texts may be
-/// dictionaries or plain.
+/// The records of a batch that has the columns of [`crate::FrameColumns`], in any order and possibly among others.
+/// Texts may be dictionaries or plain.
 pub fn records(batch: &RecordBatch) -> Result<Vec<TraceRecord>, BadColumns> {
     let columns = Columns::of(batch)?;
     (0..batch.num_rows()).map(|row| columns.record(row)).collect()
@@ -69,7 +69,7 @@ struct Columns<'a> {
     data: &'a BinaryArray,
 }
 
-/// A column of texts, in whichever way they are kept.
+/// A column of texts, in any representation.
 enum Text<'a> {
     Plain(&'a StringArray),
     Indexed { keys: Vec<Option<usize>>, texts: &'a StringArray },

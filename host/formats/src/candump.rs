@@ -62,10 +62,10 @@ mod tests {
         }
     }
 
-    /// A complete log may lack its last line end; a cut line can look whole.
+    /// A complete log may lack its last line end, and a cut line can look whole.
     #[test]
     fn a_last_line_without_its_end_counts_unless_the_identifier_had_longer_frames() {
-        // The last frame before was a short one; what counts is the longest.
+        // The frame before the last line was a short one; what counts is the longest.
         let before = "(1.000000) can0 123#DEADBEEF\n(2.000000) can0 456#\n(2.000000) can0 123#DE\n";
         for (last, records, issues) in [
             ("(3.000000) can0 123#DEADBEEF", 3, 0),

@@ -1,6 +1,6 @@
 //! cantap's own signal file: TOML that carries everything a database can say.
 //!
-//! `docs/signal-file.md` is its description for users; the structures here are its grammar.
+//! `docs/signal-file.md` describes it for users; the structures here define its grammar.
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
@@ -172,7 +172,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
 
 fn line_of(bytes: &[u8], offset: usize) -> u32 {
     let before = &bytes[..offset.min(bytes.len())];
-    // A signal file is small and this is for errors and once per table.
+    // A signal file is small, and this runs only for errors and once per table.
     before.split(|&byte| byte == b'\n').count() as u32
 }
 
@@ -350,7 +350,7 @@ fn order_missing() -> FaultKind {
     FaultKind::Syntax(text.to_owned())
 }
 
-/// `D2`, `D2:D3`, `D1.5`, `D1.7-4`: bytes count from 1, bits from 0, the least significant.
+/// `D2`, `D2:D3`, `D1.5`, `D1.7-4`: bytes count from 1, bits from 0 at the least significant.
 fn place_at(at: &str, order: Option<ByteOrder>) -> Result<Place, FaultKind> {
     let bad = || {
         FaultKind::Syntax(format!("at = {at:?} is no place; write \"D2\", \"D2:D3\", \"D1.5\" or \"D1.7-4\""))

@@ -1,7 +1,7 @@
 //! Databases from KCD files, Kayak's XML.
 //!
-//! A bit offset counts, for big-endian signals, from the highest bit of the first byte on. Which of a file's buses a channel is, the
-//! file does not say.
+//! For big-endian signals, a bit offset counts from the highest bit of the first byte. The file does not say which of its buses a
+//! channel is.
 
 use cantap_wire::Id;
 use roxmltree::{Document, Node};
@@ -16,7 +16,7 @@ pub fn parse(file: &str, bytes: &[u8]) -> Result<Database, DatabaseError> {
     parse_bus(file, bytes, None)
 }
 
-/// As [`parse`], only the bus of this name.
+/// Like [`parse`], but only the bus of this name.
 pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database, DatabaseError> {
     let text = xml::decode(bytes);
     let document = xml::parse(file, &text)?;
@@ -44,7 +44,7 @@ pub fn parse_bus(file: &str, bytes: &[u8], bus: Option<&str>) -> Result<Database
     Ok(Database { buses, ..database })
 }
 
-/// Elements by local name: writers differ in what they do with the namespace.
+/// Elements by local name: writers treat the namespace differently.
 trait Local {
     fn has_tag_name_of(&self, name: &str) -> bool;
 }

@@ -36,7 +36,7 @@ fn dbc_faults(text: &str) -> String {
     }
 }
 
-/// The documentation's example is the earlier analyser's worked example.
+/// The documentation's example comes from the earlier analyser's documentation.
 #[test]
 fn the_documented_example_decodes_as_documented() {
     let docs = include_str!("../../../docs/signal-file.md");

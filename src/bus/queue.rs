@@ -83,7 +83,7 @@ impl<const N: usize> Producer<'_, N> {
         self.high_water = self.fill();
     }
 
-    /// Whether a frame would be accepted now. After the queue was full, only once [`RESUME_FREE`] bytes are
+    /// Whether a frame would be accepted now. After the queue was full, only once `RESUME_FREE` bytes are
     /// free.
     #[inline]
     pub fn takes_frames(&mut self) -> bool {

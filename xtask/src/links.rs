@@ -24,8 +24,8 @@ pub fn check() -> Result<()> {
     ensure!(!pages.is_empty(), "no page in {}", root.display());
     let faults: Vec<String> =
         pages.iter().flat_map(|(path, page)| page.faults(&root, path, &pages)).collect();
-    ensure!(faults.is_empty(), "links that lead nowhere:\n{}", faults.join("\n"));
-    println!("{} pages: every link leads somewhere", pages.len());
+    ensure!(faults.is_empty(), "broken links:\n{}", faults.join("\n"));
+    println!("{} pages: no broken links", pages.len());
     Ok(())
 }
 

@@ -17,7 +17,7 @@ const FMPIE0: usize = 1;
 /// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it raise the receive interrupt.
 pub struct Bells<const CAN: usize>(());
 
-#[expect(clippy::unused_self, reason = "only whoever holds the bells may ring them")]
+#[expect(clippy::unused_self, reason = "only the owner of the bells may ring them")]
 impl<const CAN: usize> Bells<CAN> {
     /// Only for `Controllers::new`.
     pub(super) const fn new() -> Self {

@@ -31,7 +31,7 @@ pub(super) fn run() -> Result<()> {
             best = best.max(per_s);
         }
         println!("| {ids} | {best:.0} |");
-        ensure!(best >= AT_LEAST, "{best:.0} frames/s are below the {AT_LEAST:.0} asked for");
+        ensure!(best >= AT_LEAST, "{best:.0} frames/s are below the {AT_LEAST:.0} required");
     }
     Ok(())
 }

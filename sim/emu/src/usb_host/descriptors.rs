@@ -233,7 +233,7 @@ fn interfaces(mut bytes: &[u8]) -> Result<(Vec<Interface>, Option<(u8, u8)>), En
             (_, _) => return Err(bad(format!("a descriptor of type {kind:#04x} is out of place"))),
         }
     }
-    check(bytes.is_empty(), "a single byte is left behind the last descriptor")?;
+    check(bytes.is_empty(), "a single byte is left after the last descriptor")?;
     for interface in &interfaces {
         check(
             usize::from(interface.endpoints_told) == interface.endpoints.len(),

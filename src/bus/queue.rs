@@ -49,7 +49,7 @@ impl<const N: usize> Default for RecordQueue<N> {
     }
 }
 
-/// What a record is to the queue.
+/// How the queue treats a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// A received frame: refused when the queue is full.

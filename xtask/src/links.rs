@@ -10,7 +10,7 @@ use pulldown_cmark::{Event, Options, Parser, Tag, TagEnd};
 
 use crate::workspace;
 
-/// Endings by which code is taken for a file's path.
+/// Suffixes by which code is recognised as a file's path.
 const FILES: [&str; 7] = [".rs", ".md", ".toml", ".sh", ".svg", ".rules", ".yml"];
 
 /// Checks every page of the repository.

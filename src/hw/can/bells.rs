@@ -27,7 +27,7 @@ impl<const CAN: usize> Bells<CAN> {
     #[inline]
     fn registers() -> &'static RegisterBlock {
         let block = if CAN == 0 { CAN1::ptr() } else { CAN2::ptr() };
-        // SAFETY: the registers are there for the whole program, and `Controllers::new`, which makes the only bells, took them.
+        // SAFETY: the registers exist for the whole program, and `Controllers::new`, which makes the only bells, took them.
         unsafe { &*block }
     }
 

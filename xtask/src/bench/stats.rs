@@ -36,7 +36,8 @@ pub(super) fn run() -> Result<()> {
     Ok(())
 }
 
-/// Frames with eight bytes on both channels in turn, from `ids` extended identifiers in a mixed order.
+/// Frames with eight bytes, alternating between both channels, from `ids` extended identifiers in random
+/// order.
 fn records(ids: u32) -> Vec<TraceRecord> {
     (0..FRAMES as u64)
         .map(|n| {

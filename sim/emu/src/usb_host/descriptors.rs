@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn what_a_driver_stumbles_over_is_refused() {
-        // Offset into the configuration, the byte put there, and what is said of it.
+        // Offset into the configuration, the byte put there, and the expected message.
         for (at, byte, what) in [
             (2, 66, "wTotalLength"),
             (4, 1, "bNumInterfaces"),

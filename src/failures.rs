@@ -8,7 +8,7 @@ use core::fmt::{self, Write};
 use cantap_wire::framing::checksum;
 use cantap_wire::message::{Failures, MAX_FAILURE_TEXT};
 
-/// The log as it lies in memory. Any contents are valid values, but not all are a log.
+/// The log as it is in memory. Any contents are valid values, but not all are a log.
 #[derive(Clone, Copy, Debug)]
 #[repr(C)]
 pub struct FailureLog {

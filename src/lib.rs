@@ -1,11 +1,11 @@
 //! The analyser's logic, free of hardware: it runs on the board, in tests on the host, and in the
 //! virtual device.
 //!
-//! A received frame's way: an interrupt stamps it, [`bus::capture`] takes it out of the controller's FIFO, [`bus::recorder`] writes it
-//! with its time, after a record of any loss before it, [`bus::queue`] holds it, [`port::sender`] packs it into batches for USB. A
-//! request's way: [`port::inbox`] finds it in what the host sends, [`port::session`] decides whether it is allowed, [`port::command`]
-//! carries it out, [`bus::transmit`] puts frames on the bus. [`ports`] has what the hardware must provide, and [`port::board`] all of
-//! it together, as commands see it.
+//! The path of a received frame: an interrupt stamps it, [`bus::capture`] takes it out of the controller's FIFO, [`bus::recorder`]
+//! writes it with its time, after a record of any loss before it, [`bus::queue`] holds it, [`port::sender`] packs it into batches for
+//! USB. The path of a request: [`port::inbox`] finds it in what the host sends, [`port::session`] decides whether it is allowed,
+//! [`port::command`] carries it out, [`bus::transmit`] puts frames on the bus. [`ports`] has what the hardware must provide, and
+//! [`port::board`] all of it together, as commands see it.
 #![cfg_attr(not(test), no_std)]
 
 pub mod bus;

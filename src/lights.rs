@@ -53,7 +53,7 @@ impl Lit {
 
 /// The LEDs' state.
 #[derive(Debug, Default)]
-#[expect(clippy::struct_field_names, reason = "a unit belongs into a name")]
+#[expect(clippy::struct_field_names, reason = "a unit belongs in a name")]
 pub struct Lights {
     /// Millisecond count; wraps.
     now_ms: u16,

@@ -150,7 +150,7 @@ mod app {
         rtic::pend(Interrupt::CAN1_RX1);
     }
 
-    /// As [`can1_rx0`], for CAN2.
+    /// Same as [`can1_rx0`], for CAN2.
     #[task(binds = CAN2_RX0, priority = 5, shared = [&stamp, &can2_bells, &can2_entered])]
     fn can2_rx0(cx: can2_rx0::Context) {
         cx.shared.can2_entered.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -172,7 +172,7 @@ mod app {
         cx.shared.can1_bells.open_receive();
     }
 
-    /// As [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
+    /// Same as [`can1_drain`], for CAN2. DMA is not used, and the interrupt of its first stream raises this task: the vector of CAN2's own
     /// FIFO 1 is above those of the tasks that send, which would then go first.
     #[task(binds = DMA1_STREAM0, priority = 4, shared = [tap, &can2_bells, &can2_entered])]
     fn can2_drain(mut cx: can2_drain::Context) {
@@ -193,7 +193,7 @@ mod app {
         rtic::pend(Interrupt::USART2);
     }
 
-    /// As [`can1_tx`], for CAN2.
+    /// Same as [`can1_tx`], for CAN2.
     #[task(binds = CAN2_TX, priority = 5, shared = [&stamp, &can2_bells, &can2_sent_at])]
     fn can2_tx(cx: can2_tx::Context) {
         cx.shared.can2_sent_at.store(cx.shared.stamp.now(), Ordering::Relaxed);
@@ -214,7 +214,7 @@ mod app {
         });
     }
 
-    /// As [`can1_sent`], for CAN2, with USART3.
+    /// Same as [`can1_sent`], for CAN2, with USART3.
     #[task(binds = USART3, priority = 4, shared = [tap])]
     fn can2_sent(mut cx: can2_sent::Context) {
         cx.shared.tap.lock(|Tap { capture, traffic, alarm }| {
@@ -235,7 +235,7 @@ mod app {
         });
     }
 
-    /// As [`can1_sce`], for CAN2.
+    /// Same as [`can1_sce`], for CAN2.
     #[task(binds = CAN2_SCE, priority = 4, shared = [tap, &stamp])]
     fn can2_sce(mut cx: can2_sce::Context) {
         let entered = cx.shared.stamp.now();
@@ -266,13 +266,13 @@ mod app {
         cx.shared.catcher.catch();
     }
 
-    /// As [`exti15_10`], for a pin of the lines 5 to 9.
+    /// Same as [`exti15_10`], for a pin of the lines 5 to 9.
     #[task(binds = EXTI9_5, priority = 3, shared = [&catcher])]
     fn exti9_5(cx: exti9_5::Context) {
         cx.shared.catcher.catch();
     }
 
-    /// As [`exti15_10`], for a pin of line 0.
+    /// Same as [`exti15_10`], for a pin of line 0.
     #[task(binds = EXTI0, priority = 3, shared = [&catcher])]
     fn exti0(cx: exti0::Context) {
         cx.shared.catcher.catch();

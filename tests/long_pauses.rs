@@ -120,7 +120,7 @@ fn the_time_goes_on_while_nobody_talks_to_the_device() {
     watched.bench.greet();
     let asked = watched.now();
     let Ok(Reply::Time(told)) = watched.bench.ask(Command::Time) else { panic!() };
-    assert!((asked..=watched.now()).contains(&told), "{told} was asked for from {asked} on");
+    assert!((asked..=watched.now()).contains(&told), "{told} was requested from {asked} on");
     watched.open();
     watched.receive_in_time();
 }

@@ -114,7 +114,7 @@ fn a_controller_that_was_made_to_leave_has_its_filters_written_again() {
     }
     let written = bench.board.filters.written.clone();
     bench.ask(Command::Close { channel: CAN2 }).unwrap();
-    assert_eq!(bench.board.filters.written, written, "it left by itself");
+    assert_eq!(bench.board.filters.written, written, "it left on its own");
     bench.board.control[0].stuck = true;
     bench.board.control[0].halts_needed = 3;
     bench.ask(Command::Close { channel: CAN1 }).unwrap();
@@ -474,7 +474,7 @@ fn a_host_that_configured_the_device_anew_gets_the_rest_and_the_reason_when_it_a
     for _ in 0..100 {
         bench.millisecond();
     }
-    assert_eq!(bench.port.from_device.len(), sent, "it may be another program that listens");
+    assert_eq!(bench.port.from_device.len(), sent, "it may be another program that is listening");
 
     // In one packet each, so that the first is answered before the rest is read.
     bench.say(&encode(&Request { id: 900, command: Command::Time }));

@@ -542,6 +542,6 @@ fn a_program_whose_host_configured_the_device_anew_gets_the_rest_when_it_says_so
         bench.millisecond();
     }
     assert!(!bench.board.control[0].running);
-    assert_eq!(bench.port.from_device.len(), before, "it may be another program that listens");
+    assert_eq!(bench.port.from_device.len(), before, "it may be another program that is listening");
     converse(&mut bench, &[("t1230", "t123111\r\x07"), ("t1230", "\x07"), ("O", "\r")]);
 }

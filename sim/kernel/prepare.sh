@@ -1,7 +1,7 @@
 #!/bin/bash
 # prepare.sh CACHE: Debian's packages -> CACHE/vmlinux and CACHE/initrd. Needs apt-get, cpio, kmod and xz-utils. Ends with 75 if the
-# packages cannot be fetched. The guest's packages are unpacked, never installed here. No version is pinned: it is the stock kernel
-# of this Debian release.
+# packages cannot be fetched.
+# The guest's packages are unpacked, never installed here. No version is pinned: it is the stock kernel of this Debian release.
 set -euo pipefail
 here=$(cd "$(dirname "$0")" && pwd)
 mkdir -p "$1"
@@ -37,8 +37,8 @@ fetch() {
 image=$(apt-cache show --no-all-versions linux-image-amd64 | sed -n 's/^Depends: \(linux-image-[^ ]*\).*/\1/p')
 # The interpreter has its version in its name.
 python="$python $(apt-cache depends python3-minimal | sed -n 's/^ *PreDepends: \(python3[^ ]*\)$/\1/p')"
-# The libraries that the programs need, and those that these need; but not packages that are only named as
-# alternatives. shellcheck disable=SC2086 # lists of words
+# The libraries that the programs need, and those that these need; but not packages that are only named as alternatives.
+# shellcheck disable=SC2086 # lists of words
 libraries=$(apt-cache depends --recurse --no-recommends --no-suggests --no-conflicts --no-breaks --no-replaces --no-enhances \
   $programs $modem_manager $python | grep -E '^(lib[a-z0-9+.-]+|zlib1g)$' | grep -vE 'perl|pam|elogind|installer|cryptsetup|systemd-shared' | sort -u)
 rm -rf packages root kernel

@@ -19,13 +19,12 @@ const MOST_PPM: f64 = 500.0;
 
 /// An emulated device: `FILE.elf`, or `FILE.elf,load=50,frames=std8,bitrate=500000,seed=7`.
 ///
-/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst,
-/// and its period), `bitrate` (bit/s; by default that of whoever opens the channel), `channels` (`1`, `2` or `both`:
-/// those with traffic), `ack` (`yes`, `no`: whether the simulated nodes acknowledge),
-/// `errors` (per cent of the frames destroyed), `seed`, `ppm` (how much too fast the board's crystal is), `wire` (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`:
-/// time stands still while the client does not read; `real`: it goes on), `speed` (how fast time passes at most; 1 is
-/// real time), `timing` (`best`, `worst`: how long memories and buses keep the core waiting), and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is
-/// opened; its first interface is channel 1).
+/// Keys: `load` (per cent), `frames` (`std0` `std8` `ext0` `ext8` `rtr` `mix`), `burst` (`10/960us`: frames in a burst, and its period), `bitrate`
+/// (bit/s; by default the rate at which the channel is opened), `channels` (`1`, `2` or `both`: those with traffic), `ack` (`yes`, `no`: whether the
+/// simulated nodes acknowledge), `errors` (per cent of the frames destroyed), `seed`, `ppm` (how much too fast the board's crystal is), `wire`
+/// (`apart`: a bus for each channel; `joined`: one bus for both), `pace` (`client`: time stands still while the client does not read; `real`: it
+/// continues), `speed` (how fast time passes at most; 1 is real time), `timing` (`best`, `worst`: how long memories and buses keep the core waiting),
+/// and at the end `log=FILE` (a candump log, replayed at its own times from the moment a channel is opened; its first interface is channel 1).
 #[derive(Clone, Debug)]
 pub struct Address {
     /// The firmware.

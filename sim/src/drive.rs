@@ -102,7 +102,7 @@ pub struct Tables {
 }
 
 /// Fills every periodic entry of both channels, which are on separate buses, with frames of eight bytes that have a counter and a
-/// checksum, and watches for this long. Each entry's period is 13 µs longer than that of the one before, so that all of them meet.
+/// checksum, and watches for this long. Each entry's period is 13 µs longer than the previous one's, so that all of them meet.
 /// `None` if an entry left out a frame.
 pub fn periodic_tables(rig: &mut Rig, shortest_us: u64, watch_us: u64) -> Result<Option<Tables>, RigError> {
     let period_us = |slot: usize| shortest_us + 13 * slot as u64;

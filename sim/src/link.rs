@@ -27,7 +27,7 @@ use cantap_wire::{CHANNELS, Channel};
 pub enum Pace {
     /// Time stands still: the client sets the pace, and nothing is lost on its account.
     Client,
-    /// Time goes on, and the device's queue fills.
+    /// Time continues, and the device's queue fills.
     RealTime,
 }
 
@@ -128,8 +128,8 @@ pub struct Served {
 }
 
 impl Served {
-    /// Boots the firmware, enumerates the device and opens its port. A bus with a bit rate of its own carries the traffic
-    /// of `options` from now on, any other and a replayed log as long as the channel is open.
+    /// Boots the firmware, enumerates the device and opens its port. A bus with a given bit rate carries the traffic of
+    /// `options` from now on; any other bus, or a replayed log, only while the channel is open.
     pub fn start(image: Image, options: Options, manner: Manner) -> Result<Self, RigError> {
         let setup = Setup { joined: manner.joined, bound: options.bound, ..board::setup_for(&image) };
         let mut rig = Rig::new(image, setup, options.timing);

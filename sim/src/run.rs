@@ -208,7 +208,7 @@ pub fn run(image: Image, options: &Options) -> Result<(Report, Option<(Machine, 
     let mut faults = rig.ledger.faults().to_vec();
     faults.extend(rig.session.corruptions().iter().map(|corruption| format!("on USB: {corruption:?}")));
     if !drained {
-        faults.push("the device did not come to an end of what it had to say".to_owned());
+        faults.push("the device did not finish sending what it had to send".to_owned());
     }
     let report = Report {
         seconds,

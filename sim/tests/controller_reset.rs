@@ -61,7 +61,7 @@ fn stuck_and_closed(master_reset: MasterReset) -> Rig {
     rig.run_for(5 * MS).unwrap();
     let ended =
         rig.events().iter().filter(|(_, event)| matches!(event, Event::TransmitFailed { .. })).count();
-    assert_eq!(ended, 4, "each is told of");
+    assert_eq!(ended, 4, "each is reported");
     assert_eq!(rig.events().last().map(|(_, event)| *event), Some(Event::Stopped { channel: Can1 }));
     hold(&mut rig, false);
     rig.run_for(2 * MS).unwrap();

@@ -108,7 +108,10 @@ fn the_device_survives_a_host_that_goes_away_at_any_instant() {
             rig.run_for(GRACE).unwrap();
             if disruption.ends_the_session() {
                 for channel in Channel::ALL {
-                    assert!(!rig.takes_part(channel), "{disruption:?}: {channel:?} listens on for nobody");
+                    assert!(
+                        !rig.takes_part(channel),
+                        "{disruption:?}: {channel:?} still listens with nobody there"
+                    );
                 }
             }
             rig.run_for(random.u64(..10 * MS)).unwrap();
@@ -216,7 +219,7 @@ fn a_host_that_wakes_is_told_that_the_session_has_ended_and_misses_nothing() {
         let asleep_at = rig.now();
         rig.run_for(50 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
         assert_eq!(rig.session_end(), None);
         rig.with_host(UsbHost::resume);

@@ -275,7 +275,7 @@ print("done")
             }
         }
         assert!(std::env::var_os("CANTAP_REQUIRE_PEERS").is_none(), "no Python with python-can and pyserial");
-        eprintln!("SKIPPED: no Python with python-can and pyserial; name one that has in CANTAP_PYTHON");
+        eprintln!("SKIPPED: no Python with python-can and pyserial; name one that has them in CANTAP_PYTHON");
         None
     }
 

@@ -45,7 +45,7 @@ fn settle(rig: &mut Rig) {
     }
     assert!(rig.ledger.holds(), "{:?}", rig.ledger.faults());
     assert_eq!(rig.session.corruptions(), []);
-    assert_eq!(rig.machine.board().odd_accesses(), [], "accesses that no model knows or no hardware takes");
+    assert_eq!(rig.machine.board().odd_accesses(), [], "accesses that no model knows or no hardware accepts");
 }
 
 /// Received frames with their stamps in ticks.

@@ -80,7 +80,7 @@ fn a_device_that_is_configured_again_begins_with_data0_on_every_pipe() {
         assert_eq!(ask(&mut rig, Request::set_configuration(0)), Outcome::Done(Vec::new()), "round {round}");
         rig.run_for(5 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
         rig.cut();
         assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()), "round {round}");
@@ -108,12 +108,12 @@ fn a_client_under_which_the_device_is_configured_anew_is_told_when_it_asks() {
         assert_eq!(ask(&mut rig, Request::set_configuration(1)), Outcome::Done(Vec::new()));
         rig.run_for(10 * MS).unwrap();
         for channel in Channel::ALL {
-            assert!(!rig.takes_part(channel), "{channel:?} listens on for nobody");
+            assert!(!rig.takes_part(channel), "{channel:?} still listens with nobody there");
         }
-        assert_eq!(rig.session_end(), None, "round {round}: told to whoever listens");
+        assert_eq!(rig.session_end(), None, "round {round}: reported to a program that may be a new one");
         rig.ask(Command::Status).unwrap_err();
         let Some((ticks, EndReason::Configured)) = rig.session_end() else {
-            panic!("round {round}: refused before the end was told: {:?}", rig.session_end());
+            panic!("round {round}: refused before the end was reported: {:?}", rig.session_end());
         };
         let ended_at = rig.clock_origin() + ticks * 12;
         assert!((configured_at..configured_at + 3 * MS).contains(&ended_at), "round {round}");
@@ -227,6 +227,6 @@ fn what_the_descriptors_do_not_offer_is_refused() {
     let Outcome::Done(head) = ask(&mut rig, Request::new(0x80, GET_DESCRIPTOR, 2 << 8, 0, 9)) else {
         panic!()
     };
-    assert_eq!((head[7], head[8]), (0x80, 50), "fed by the bus, without remote wakeup, 100 mA");
+    assert_eq!((head[7], head[8]), (0x80, 50), "powered by the bus, without remote wakeup, 100 mA");
     nothing_was_lost(rig);
 }

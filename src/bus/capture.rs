@@ -302,7 +302,7 @@ impl<'q, const N: usize> Capture<'q, N> {
         self.arm(clock);
     }
 
-    /// Once a millisecond: keeps time going, reads what no interrupt reports, retries what found no room.
+    /// Once a millisecond: keeps time, reads what no interrupt reports, retries what had no room.
     pub fn on_tick<T: Traffic>(&mut self, traffic: &mut [T; CHANNELS], clock: &impl Clock) {
         for channel in Channel::ALL {
             if self.on_tick_errors(channel, &mut traffic[channel.index()], clock) {

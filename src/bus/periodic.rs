@@ -139,7 +139,7 @@ impl PeriodicTable {
         self.due = due.map_or(NEVER, |due| due.max(self.look_from));
     }
 
-    /// When [`Self::look`] is to be called; [`NEVER`] if all entries wait.
+    /// When [`Self::look`] must be called next; [`NEVER`] if all entries wait.
     #[inline]
     pub const fn due(&self) -> u64 {
         self.due

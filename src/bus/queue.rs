@@ -49,7 +49,7 @@ impl<const N: usize> Default for RecordQueue<N> {
     }
 }
 
-/// What a record is to the queue.
+/// How the queue treats a record.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Kind {
     /// A received frame: refused when the queue is full.
@@ -83,7 +83,7 @@ impl<const N: usize> Producer<'_, N> {
         self.high_water = self.fill();
     }
 
-    /// Whether a frame would be accepted now. After the queue was full, only once [`RESUME_FREE`] bytes are
+    /// Whether a frame would be accepted now. After the queue was full, only once `RESUME_FREE` bytes are
     /// free.
     #[inline]
     pub fn takes_frames(&mut self) -> bool {

@@ -291,7 +291,7 @@ impl<'q> Transmitter<'q> {
             // Cannot fail: checked above.
             let _ = self.unconfirmed.push_back(Ended { tag, frame, failure, at });
         }
-        // No matter which task collects: a stamp left behind would be taken for the next transmission's.
+        // No matter which task collects: a stamp that stays would be mistaken for the next transmission's.
         traffic.await_finished();
     }
 

@@ -83,7 +83,7 @@ impl ReceivePin {
 
     /// Where to read its level.
     fn level(self) -> Level {
-        // SAFETY: the ports' registers are there for the whole program.
+        // SAFETY: the ports' registers exist for the whole program.
         let idr = unsafe {
             match self.port {
                 #[cfg(feature = "stm32f4-discovery")]

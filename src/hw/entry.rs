@@ -84,8 +84,8 @@ pub fn restore(rcc: &pac::RCC, syscfg: &pac::SYSCFG, flash: &pac::FLASH) -> Foun
     reset_peripherals(rcc);
     map_flash_at_zero(rcc, syscfg);
     super::flash::lock(flash);
-    // Clear the interrupts that peripherals raised before they were reset. SAFETY: no interrupt is
-    // wanted yet, and all are masked.
+    // Clear the interrupts that peripherals raised before they were reset.
+    // SAFETY: no interrupt is wanted yet, and all are masked.
     unsafe { (*NVIC::PTR).icpr.iter().for_each(|clear| clear.write(u32::MAX)) };
     Found { usb_was_connected }
 }

@@ -1,5 +1,5 @@
-//! What one run of the firmware tells the next: a word of RAM that startup does not touch and that survives every reset except a
-//! loss of power.
+//! A message from one run of the firmware to the next: a word of RAM that startup does not touch and that survives every reset
+//! except a loss of power.
 
 use core::mem::MaybeUninit;
 use core::ptr::{addr_of, addr_of_mut};

@@ -41,8 +41,8 @@ impl StampTimer {
     #[inline]
     #[expect(clippy::unused_self, reason = "a timer proves that it was started")]
     pub(super) fn registers(self) -> &'static RegisterBlock {
-        // SAFETY: the registers are there for the whole program. `start` took the peripheral and makes the only alarm, so only
-        // its owner writes the alarm's registers; the latch writes channel 4's, at the start.
+        // SAFETY: the registers exist for the whole program. `start` took the peripheral and makes the only alarm, so only its
+        // owner writes the alarm's registers; the latch writes channel 4's, at the start.
         unsafe { &*TIM2::ptr() }
     }
 }

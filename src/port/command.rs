@@ -479,8 +479,8 @@ impl Commands {
         saved_reports(board)
     }
 
-    /// Stores each configured channel's settings beside what is stored for the other, and, if given, whether slcan's reports are
-    /// wanted.
+    /// Stores each configured channel's settings, keeping what is stored for the other, and, if given, whether slcan's reports
+    /// are wanted.
     #[inline(never)]
     pub fn save<'q, const N: usize>(
         &self,

@@ -1,5 +1,5 @@
 //! Packs queued records into batches: walks whole records and keeps the running time, so that every
-//! batch carries an absolute time of its own.
+//! batch carries its own absolute time.
 
 use cantap_wire::CHANNELS;
 use cantap_wire::batch::BatchWriter;

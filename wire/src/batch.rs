@@ -1,4 +1,4 @@
-//! Batches: records packed so that each batch stands alone. Losing one loses its records only, and
+//! Batches: records packed so that each batch stands alone. Losing one loses only its records, and
 //! the next one says exactly how many frames those were.
 
 use crate::framing::{CRC_LEN, MAX_MESSAGE, crc32, seal, seal_with};

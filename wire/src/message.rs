@@ -291,7 +291,7 @@ pub enum Refusal {
     BanksExhausted {
         /// Banks that they need.
         needed: u8,
-        /// Banks that there are.
+        /// Banks available.
         available: u8,
     },
     /// It cannot be done without disturbing the other channel, which is open.

@@ -8,9 +8,9 @@
 //! | `0x40..=0x47` | qualifiers of the frame that follows: bit 0 the stamp is only an upper bound, bit 1 no time difference, bit 2 no data |
 //! | `0x80..=0xFF` | a received frame: bit 6 channel, bit 5 extended, bit 4 remote, bits 3..0 DLC; then the ID (2 or 4 bytes, little-endian), the time difference, the data |
 //!
-//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the record before. They are signed because a
-//! stamp may be computed back to a time before the other channel's last one, and wide because nothing bounds the time between
-//! two records: a host may open a channel hours after its greeting, or read nothing for hours.
+//! Time differences are postcard's `i64` (zigzag, 7 bits a byte), in ticks since the previous record. They are signed because
+//! a stamp may be computed back to a time before the other channel's last one, and wide because nothing bounds the time
+//! between two records: a host may open a channel hours after its greeting, or read nothing for hours.
 
 pub use cantap_can::{BusErrorKind, ErrorState};
 use serde::{Deserialize, Serialize};
@@ -43,7 +43,7 @@ pub enum Stamp {
     Exact,
     /// The frame was found queued behind another one: it ended at this time or earlier.
     UpperBound,
-    /// Left out on request; the record's time is that of the record before.
+    /// Left out on request; the record's time is that of the previous record.
     Omitted,
 }
 
@@ -192,7 +192,7 @@ pub enum Record {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct BadRecord;
 
-/// Writes a received frame and returns its length. `ticks` is the time since the record before.
+/// Writes a received frame and returns its length. `ticks` is the time since the previous record.
 #[inline]
 pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     let frame = &received.frame;
@@ -231,7 +231,7 @@ pub fn encode_received(received: &Received, ticks: i64, out: &mut [u8; MAX_RECOR
     len
 }
 
-/// Writes an event and returns its length. `ticks` is the time since the record before.
+/// Writes an event and returns its length. `ticks` is the time since the previous record.
 #[inline]
 pub fn encode_event(event: &Event, ticks: i64, out: &mut [u8; MAX_RECORD]) -> usize {
     // While a host streams, nearly all events are confirmations.

@@ -40,7 +40,7 @@ pub fn check(shell: &Shell) -> Result<Outcome> {
         .is_err()
     {
         return Ok(Outcome::Skipped(format!(
-            "here is {here}; `rustup toolchain install {oldest}` brings the one to check"
+            "this is {here}; `rustup toolchain install {oldest}` installs the one to check"
         )));
     }
     let target = workspace::target().join("oldest-compiler");

@@ -47,7 +47,7 @@ pub fn check(shell: &Shell) -> Result<()> {
         .chain(sources(&others))
         .collect();
     ensure!(faults.is_empty(), "against deny.toml:\n{}", faults.join("\n"));
-    println!("{} crates of others: licences, versions and sources are as deny.toml allows", others.len());
+    println!("{} crates of other people: licences, versions and sources are allowed", others.len());
     Ok(())
 }
 
@@ -57,7 +57,7 @@ fn licences<'a>(others: &'a [&Package], allowed: &'a [String]) -> impl Iterator<
         let Some(text) = &package.license else { return Some(format!("{name} {version} names no licence")) };
         // Older crates write `/` for OR.
         match Expression::parse_mode(text, ParseMode::LAX) {
-            Err(error) => Some(format!("{name} {version} has a licence that is no SPDX expression: {error}")),
+            Err(error) => Some(format!("{name} {version} has a licence that is not valid SPDX: {error}")),
             Ok(expression) if expression.evaluate(|licence| is_allowed(licence, allowed)) => None,
             Ok(_) => Some(format!("{name} {version} is under {text}, which is not allowed")),
         }
@@ -80,7 +80,7 @@ fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String
     for (name, versions) in versions.iter().filter(|(_, versions)| versions.len() > 1) {
         let open = versions.iter().filter(|version| !excused.contains(version.as_str())).count();
         if open > 1 {
-            faults.push(format!("{name} is there {} times: {}", versions.len(), versions.join(", ")));
+            faults.push(format!("{name} is present in {} versions: {}", versions.len(), versions.join(", ")));
         }
         needed.extend(versions.iter().cloned());
     }
@@ -88,7 +88,7 @@ fn duplicates(others: &[&Package], skip: &[Skip]) -> impl Iterator<Item = String
         excused
             .iter()
             .filter(|excuse| !needed.contains(**excuse))
-            .map(|excuse| format!("{excuse} needs no excuse any more")),
+            .map(|excuse| format!("{excuse} no longer needs an excuse")),
     );
     faults.into_iter()
 }

@@ -10,7 +10,7 @@ use pulldown_cmark::{Event, Options, Parser, Tag, TagEnd};
 
 use crate::workspace;
 
-/// Endings by which code is taken for a file's path.
+/// Suffixes by which code is recognised as a file's path.
 const FILES: [&str; 7] = [".rs", ".md", ".toml", ".sh", ".svg", ".rules", ".yml"];
 
 /// Checks every page of the repository.
@@ -24,8 +24,8 @@ pub fn check() -> Result<()> {
     ensure!(!pages.is_empty(), "no page in {}", root.display());
     let faults: Vec<String> =
         pages.iter().flat_map(|(path, page)| page.faults(&root, path, &pages)).collect();
-    ensure!(faults.is_empty(), "links that lead nowhere:\n{}", faults.join("\n"));
-    println!("{} pages: every link leads somewhere", pages.len());
+    ensure!(faults.is_empty(), "broken links:\n{}", faults.join("\n"));
+    println!("{} pages: no broken links", pages.len());
     Ok(())
 }
 

@@ -20,12 +20,12 @@ pub fn check(shell: &Shell) -> Result<()> {
 
 /// A package has its own copies: where symbolic links are not preserved, a link would become a file containing a path.
 fn licences(shell: &Shell, package: &Package) -> Result<()> {
-    let directory = package.manifest_path.parent().context("a manifest lies in no directory")?;
+    let directory = package.manifest_path.parent().context("a manifest has no directory")?;
     for licence in ["LICENSE-MIT", "LICENSE-APACHE"] {
         let own = shell.read_file(directory.join(licence)).with_context(|| package.name.clone())?;
         ensure!(
             own == shell.read_file(licence)?,
-            "{}'s {licence} is not the workspace's: copy it",
+            "{}'s {licence} differs from the workspace's: copy it",
             package.name
         );
     }

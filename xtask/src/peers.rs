@@ -37,7 +37,7 @@ impl Peers {
             let packages = missing.join(" ");
             if !toolchain::can_install() {
                 println!(
-                    "not compared with {packages}: run `apt-get install {packages}` or your system's like"
+                    "not compared with {packages}: run `apt-get install {packages}` or your system's equivalent"
                 );
                 return Ok(None);
             }

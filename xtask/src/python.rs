@@ -127,6 +127,6 @@ fn python_can(shell: &Shell, python: &Path) -> Result<PathBuf> {
 
 fn only_file(folder: &Path) -> Result<PathBuf> {
     let mut files = std::fs::read_dir(folder)?.map(|entry| Ok(entry?.path())).collect::<Result<Vec<_>>>()?;
-    ensure!(files.len() == 1, "one file was to be made in {}, there are {}", folder.display(), files.len());
+    ensure!(files.len() == 1, "expected one file in {}, found {}", folder.display(), files.len());
     Ok(files.remove(0))
 }

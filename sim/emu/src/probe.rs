@@ -112,7 +112,7 @@ impl Probe {
         self.asleep
     }
 
-    /// Core cycles in which the core stood still because flash was being written.
+    /// Core cycles in which the core was stalled because flash was being written.
     pub fn stalled(&self) -> u64 {
         self.stalled
     }

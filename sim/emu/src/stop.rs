@@ -12,7 +12,7 @@ const MAX_DEPTH: usize = 32;
 /// Bytes of stack to search for them.
 const MAX_STACK: u32 = 8 * 1024;
 
-/// Why the firmware cannot go on.
+/// Why the firmware cannot continue.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Reason {
     /// A fault, with CFSR, HFSR, MMFAR and BFAR.

@@ -17,7 +17,7 @@ const FMPIE0: usize = 1;
 /// FIFO 0's overrun needs no interrupt: a FIFO that overran is full, and the frames in it raise the receive interrupt.
 pub struct Bells<const CAN: usize>(());
 
-#[expect(clippy::unused_self, reason = "only whoever holds the bells may ring them")]
+#[expect(clippy::unused_self, reason = "only the owner of the bells may ring them")]
 impl<const CAN: usize> Bells<CAN> {
     /// Only for `Controllers::new`.
     pub(super) const fn new() -> Self {
@@ -27,7 +27,7 @@ impl<const CAN: usize> Bells<CAN> {
     #[inline]
     fn registers() -> &'static RegisterBlock {
         let block = if CAN == 0 { CAN1::ptr() } else { CAN2::ptr() };
-        // SAFETY: the registers are there for the whole program, and `Controllers::new`, which makes the only bells, took them.
+        // SAFETY: the registers exist for the whole program, and `Controllers::new`, which makes the only bells, took them.
         unsafe { &*block }
     }
 

@@ -11,7 +11,7 @@ enum Halt {
     None,
     /// The reset is requested; the controller acknowledges it by sleeping.
     Resetting,
-    /// It has been woken and told to enter initialisation mode.
+    /// It has been woken and is to enter initialisation mode.
     Entering,
 }
 

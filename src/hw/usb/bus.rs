@@ -371,8 +371,8 @@ impl usb_device::bus::UsbBus for Bus {
         self.core.with(|core| core.is_halted(address))
     }
 
-    /// The transceiver's clock stays on. Stopping it saves little beside a processor at 144 MHz, and whether a reset after
-    /// a replug would then be noticed, where nothing measures VBUS, only a real board can show.
+    /// The transceiver's clock stays on. Stopping it saves little compared with a processor at 144 MHz, and whether a
+    /// reset after a replug would then be noticed, where nothing measures VBUS, only a real board can show.
     fn suspend(&self) {
         self.core.with(|core| core.suspended = true);
     }

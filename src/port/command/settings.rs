@@ -41,7 +41,7 @@ pub(super) fn saved<'q, const N: usize>(channel: Channel, board: &mut impl Board
     None
 }
 
-/// Whether slcan's reports were saved as wanted (`K1`).
+/// Whether the saved settings ask for slcan's reports (`K1`).
 #[inline(never)]
 pub(super) fn saved_reports<'q, const N: usize>(board: &mut impl Board<'q, N>) -> bool {
     let mut bytes = [0; MAX_SAVED];

@@ -1,6 +1,6 @@
-//! Losses, errors and states as lines of their own, where a host asks for them (`K1`): in the form that Linux's slcan
-//! driver has understood since 6.0 (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details
-//! -statistics link`.
+//! Losses, errors and states as separate lines, if a host asks for them (`K1`), in the form that Linux's slcan driver
+//! has understood since 6.0 (`drivers/net/can/slcan/slcan-core.c`), so that they reach `ip -details -statistics
+//! link`.
 //!
 //! `e`, a digit and that many letters are errors; each line counts an error once, however often it names it. The driver ignores
 //! lines shorter than five characters, so an error is named three times. `s`, a letter and two counters of three decimal digits,

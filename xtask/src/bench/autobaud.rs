@@ -33,7 +33,7 @@ const DENSITIES: [(&str, &str); 4] = [
 ];
 /// Frames destroyed, in per cent.
 const DAMAGE: [u32; 2] = [0, 30];
-/// Runs of each cell, on both channels in turn, and of a quick measurement.
+/// Runs per cell, alternating between both channels: normally, and for a quick measurement.
 const RUNS: [u64; 2] = [6, 2];
 /// How long without anything new until a search is given up.
 const SILENCE: Duration = Duration::from_secs(3);

@@ -29,7 +29,7 @@ enum Other {
     Idle,
     /// It receives as much as a bus can carry.
     Full,
-    /// It takes part in a bus of its own and does the same as channel 1.
+    /// It takes part in a separate bus and does the same as channel 1.
     Joined,
 }
 

@@ -40,7 +40,7 @@ pub fn run() -> Result<()> {
         line("the same while both run, as in a capture", clocks.live);
         let bound = |report: ClockReport| report.uncertainty_ns.map_or(f64::NAN, |ns| ns as f64 / 1e3);
         println!(
-            "  bounds that the clock tells at the end: {:.0} us by round trips alone, {:.0} us by frames",
+            "  bounds that the clock reports at the end: {:.0} us by round trips alone, {:.0} us by frames",
             bound(clocks.alone.1),
             bound(clocks.frames.1)
         );

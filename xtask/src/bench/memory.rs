@@ -107,7 +107,7 @@ pub fn run() -> Result<()> {
         println!("{name:<32} {:>10.1} {:>10.1}", mib[0], mib[1]);
     }
     let most = rows.iter().flat_map(|(_, mib)| mib).copied().fold(0.0, f64::max);
-    ensure!(most < MOST_MIB, "{most:.1} MiB are too many; {MOST_MIB} are allowed");
+    ensure!(most < MOST_MIB, "{most:.1} MiB is too much; {MOST_MIB} MiB is allowed");
     Ok(())
 }
 

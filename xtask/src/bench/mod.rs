@@ -49,7 +49,7 @@ enum Subject {
     Wire,
     /// Converting and reading trace files, against log2asc and python-can.
     Formats,
-    /// Sizes and times of Parquet, beside trace formats.
+    /// Sizes and times of Parquet, compared with trace formats.
     Columns,
     /// How much memory the command occupies with long traces, in every format.
     Memory,
@@ -143,7 +143,7 @@ pub fn run(args: &Args) -> Result<()> {
             Subject::Serve => serve::run(args.seconds)?,
             #[cfg(not(unix))]
             Subject::Serve => {
-                anyhow::bail!("a board is shared by UNIX sockets here, which this system has none of")
+                anyhow::bail!("this shares a board over UNIX sockets, which this system does not have")
             }
         }
     }

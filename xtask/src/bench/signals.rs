@@ -34,7 +34,7 @@ pub fn run() -> Result<()> {
     let (signals, seconds) = ours(&decoder, &frames);
     let per_round = signals.1;
     let rate = signals.0 as f64 / seconds;
-    println!("signals: {} frames of {DATABASE}, decoded over and over", frames.len());
+    println!("signals: {} frames of {DATABASE}, decoded repeatedly", frames.len());
     println!("{:<10} {:>12} {:>12}", "", "signals/s", "frames/s");
     let frames_per_signal = frames.len() as f64 / per_round as f64;
     println!("{:<10} {:>12.0} {:>12.0}", "cantap", rate, rate * frames_per_signal);

@@ -31,12 +31,13 @@ pub(super) fn run() -> Result<()> {
             best = best.max(per_s);
         }
         println!("| {ids} | {best:.0} |");
-        ensure!(best >= AT_LEAST, "{best:.0} frames/s are below the {AT_LEAST:.0} asked for");
+        ensure!(best >= AT_LEAST, "{best:.0} frames/s are below the {AT_LEAST:.0} required");
     }
     Ok(())
 }
 
-/// Frames with eight bytes on both channels in turn, from `ids` extended identifiers in a mixed order.
+/// Frames with eight bytes, alternating between both channels, from `ids` extended identifiers in random
+/// order.
 fn records(ids: u32) -> Vec<TraceRecord> {
     (0..FRAMES as u64)
         .map(|n| {

@@ -40,7 +40,7 @@ pub fn run() -> Result<()> {
         let nanos = begin.elapsed().as_nanos() as f64 / FRAMES as f64;
         let per_frame = bytes as f64 / FRAMES as f64;
         println!("{:<6} {:>12.2} {:>8.1} {:>14.1}", kind.name, per_frame, kind.budget, nanos);
-        ensure!(per_frame <= kind.budget, "{} takes more bytes per frame than it may", kind.name);
+        ensure!(per_frame <= kind.budget, "{} takes more bytes per frame than allowed", kind.name);
     }
     Ok(())
 }

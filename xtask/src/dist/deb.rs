@@ -22,7 +22,7 @@ const COMPLETIONS: [(&str, &str); 3] = [
 pub fn pack(shell: &Shell, dist: &Path) -> Result<()> {
     ensure!(
         is_installed("dpkg-deb"),
-        "there is no dpkg-deb; on Debian it belongs to the system, elsewhere install `dpkg`"
+        "dpkg-deb is missing; on Debian it is part of the system, elsewhere install `dpkg`"
     );
     let built = command::build(shell)?;
     let architecture = cmd!(shell, "dpkg --print-architecture").quiet().read()?;

@@ -48,12 +48,12 @@ fn flash_image(bytes: &[u8]) -> Result<Vec<u8>> {
     let endian = file.endian();
     let mut image = Vec::new();
     for segment in file.elf_header().program_headers(endian, bytes)? {
-        let data = segment.data(endian, bytes).ok().context("a segment lies outside the ELF")?;
+        let data = segment.data(endian, bytes).ok().context("a segment is outside the ELF")?;
         if segment.p_type(endian) != elf::PT_LOAD || data.is_empty() {
             continue;
         }
         let start = (segment.p_paddr(endian) as usize).wrapping_sub(FLASH_START);
-        ensure!(start < FLASH_LEN, "a segment lies outside the flash");
+        ensure!(start < FLASH_LEN, "a segment is outside the flash");
         // Erased flash reads as ones.
         image.resize(image.len().max(start + data.len()), 0xFF);
         image[start..start + data.len()].copy_from_slice(data);

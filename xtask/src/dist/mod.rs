@@ -41,7 +41,7 @@ pub fn run(args: &Args) -> Result<()> {
     for what in if args.what.is_empty() { What::value_variants() } else { &args.what } {
         match what {
             What::Command => command::pack(&shell, &dist)?,
-            What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is no Linux"),
+            What::Deb if !cfg!(target_os = "linux") => println!("no Debian package: this is not Linux"),
             What::Deb => deb::pack(&shell, &dist)?,
             What::Python => {
                 for file in python::dist(&shell)? {

@@ -29,7 +29,7 @@ pub fn write(shell: &Shell, path: &Path, selection: &[&str]) -> Result<()> {
             count += 1;
         }
     }
-    ensure!(count > 0, "cargo tree names no crate of others");
+    ensure!(count > 0, "cargo tree names no crates of other people");
     shell.write_file(path, text)?;
     Ok(())
 }
@@ -48,7 +48,7 @@ fn add(shell: &Shell, text: &mut String, package: &Package) -> Result<()> {
     if let Some(repository) = &package.repository {
         writeln!(text, "{repository}")?;
     }
-    let directory = package.manifest_path.parent().context("a manifest lies in no directory")?;
+    let directory = package.manifest_path.parent().context("a manifest has no directory")?;
     for file in shell.read_dir(directory)? {
         let name = file.file_name().map(|name| name.to_string_lossy().to_uppercase()).unwrap_or_default();
         if file.is_file() && FILES.iter().any(|known| name.starts_with(known)) {

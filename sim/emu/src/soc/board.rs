@@ -229,7 +229,7 @@ impl Board {
         self.watchdog.deadline()
     }
 
-    /// The core cycle at which TIM2 stood at zero, if it has counted without being written or stopped since.
+    /// The core cycle at which TIM2 was at zero, if it has counted since without being written or stopped.
     pub fn tim2_origin(&mut self, now: u64) -> u64 {
         self.timers[0].origin(now)
     }

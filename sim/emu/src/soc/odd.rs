@@ -34,7 +34,7 @@ impl fmt::Display for OddAccess {
         let reason = match self.oddity {
             Oddity::Unknown => "no model knows it",
             Oddity::Unclocked => "its peripheral's clock is off",
-            Oddity::Refused => "the hardware does not take it now",
+            Oddity::Refused => "the hardware does not accept it now",
             Oddity::TooFast => "flash has too few wait states for the clock",
         };
         write!(f, "{kind} of {:#010x}, {} times: {reason}", self.address, self.count)

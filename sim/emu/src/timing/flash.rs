@@ -171,7 +171,7 @@ mod tests {
         assert_eq!(
             flash.fetch(0x800, true, 101, &FOUR),
             0,
-            "from the start of a line nothing beyond was asked for"
+            "from the start of a line nothing beyond it was requested"
         );
         let off = Speeds { instruction_cache: false, ..FOUR };
         assert_eq!(flash.fetch(0x400, true, 200, &off), 4);

@@ -233,7 +233,7 @@ fn interfaces(mut bytes: &[u8]) -> Result<(Vec<Interface>, Option<(u8, u8)>), En
             (_, _) => return Err(bad(format!("a descriptor of type {kind:#04x} is out of place"))),
         }
     }
-    check(bytes.is_empty(), "a single byte is left behind the last descriptor")?;
+    check(bytes.is_empty(), "a single byte is left after the last descriptor")?;
     for interface in &interfaces {
         check(
             usize::from(interface.endpoints_told) == interface.endpoints.len(),
@@ -293,7 +293,7 @@ mod tests {
 
     #[test]
     fn what_a_driver_stumbles_over_is_refused() {
-        // Offset into the configuration, the byte put there, and what is said of it.
+        // Offset into the configuration, the byte put there, and the expected message.
         for (at, byte, what) in [
             (2, 66, "wTotalLength"),
             (4, 1, "bNumInterfaces"),

@@ -367,7 +367,7 @@ impl<D: HostDriver> UsbHost<D> {
 
     fn start_frame(&mut self, otg: &mut Otg) {
         if !otg.pulled_up(true) {
-            // The device went away by itself (reset, bootloader): the port sees a disconnection.
+            // The device went away on its own (reset, bootloader): the port sees a disconnection.
             self.rest();
             return;
         }

@@ -1,6 +1,6 @@
 #!/bin/sh
-# shellcheck shell=dash `cantap bridge`: both channels on interfaces of the kernel's own, used by
-# can-utils and python-can.
+# shellcheck shell=dash
+# `cantap bridge`: both channels on interfaces of the kernel's own, used by can-utils and python-can.
 
 has_port || attach
 modprobe -a vcan vxcan
@@ -98,7 +98,7 @@ for _job in "100 mix 4000" "100 std0 20000"; do
   done
 done
 
-# A bridge that only listens sends nothing, and says so.
+# While the bridge only listens, what programs write is not sent, and the bridge says so.
 board traffic 0 mix
 bridge bus0
 listen bus0

@@ -1,6 +1,7 @@
 #!/bin/sh
-# shellcheck shell=dash Anything that may happen to a client, the driver or the cable in mid-stream: the client reports it and continues when
-# the device is back, and the next capture is exact.
+# shellcheck shell=dash
+# Anything that may happen to a client, the driver or the cable in mid-stream: the client reports it and continues when the device is back,
+# and the next capture is exact.
 
 has_port || attach
 DEVICE=$(device)

@@ -1,6 +1,7 @@
 #!/bin/sh
-# shellcheck shell=dash ModemManager probes every new serial port. It must do no harm: no channel is opened, not a single dominant
-# bit is sent, and what follows works.
+# shellcheck shell=dash
+# ModemManager probes every new serial port. It must do no harm: no channel is opened, not a single dominant bit is sent, and what follows
+# works.
 
 has_port || attach
 

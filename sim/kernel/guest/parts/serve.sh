@@ -1,6 +1,6 @@
 #!/bin/sh
-# shellcheck shell=dash `cantap serve` on the board: a capture through it is exact, and a killed server leaves a silent board, and
-# clients that know about it.
+# shellcheck shell=dash
+# `cantap serve` on the board: a capture through it is exact, and a killed server leaves a silent board, and clients that know about it.
 
 has_port || attach
 board traffic 50 mix

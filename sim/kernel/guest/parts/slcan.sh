@@ -1,6 +1,6 @@
 #!/bin/sh
-# shellcheck shell=dash The kernel's slcan driver, set up by slcand and by ip, with can-utils on top
-# of it.
+# shellcheck shell=dash
+# The kernel's slcan driver, set up by slcand and by ip, with can-utils on top of it.
 
 has_port || attach
 

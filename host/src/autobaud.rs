@@ -38,7 +38,7 @@ const MOST_ERRORS: u32 = 12;
 const ROUNDS: u32 = 3;
 /// How often to ask the device.
 const ASK_EVERY: Duration = Duration::from_millis(2);
-/// A measurement with this standard error is good enough; otherwise measuring goes on for a while.
+/// A measurement with this standard error is good enough; otherwise measuring continues for a while.
 const GOOD_ERROR: f64 = 0.000_3;
 /// If the measurement has not improved after this time, it is used as it is.
 const BETTER_WITHIN: Duration = Duration::from_millis(150);

@@ -18,7 +18,7 @@ use cantap_trace::bits::{FrameBits, INTERMISSION_BITS};
 const LEAD: Duration = Duration::from_millis(100);
 /// Frames due later than this wait in the host: a device refuses those more than a day ahead.
 const MOST_AHEAD: Duration = Duration::from_hours(1);
-/// How often to check whether to go on.
+/// How often to check whether to continue.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 
 /// How to change the trace's times.

@@ -17,7 +17,7 @@ use crate::{Device, DeviceError};
 
 /// Requests in flight: with 20 frames each, more than both buses can send in a USB round trip.
 const REQUESTS: usize = 6;
-/// How often to check whether to go on while waiting for a confirmation.
+/// How often to check whether to continue while waiting for a confirmation.
 const LOOK_EVERY: Duration = Duration::from_millis(20);
 /// Tags wrap here, far below the device's own tags and far above the number in flight.
 const TAGS: u32 = 1 << 24;

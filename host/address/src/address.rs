@@ -14,7 +14,7 @@ use cantap_virtual::Options;
 
 use crate::server::{Server, ServerError};
 
-/// The bit rate of the virtual device's buses is set by whoever opens a channel; this is the one assumed
+/// The bit rate of the virtual device's buses is set by the program that opens a channel; this is the one assumed
 /// otherwise.
 const VIRTUAL_BITRATE_BPS: u32 = 500_000;
 
@@ -40,7 +40,7 @@ enum Place {
     Emulated(Box<cantap_sim::address::Address>),
 }
 
-/// Why a text is no device address.
+/// Why a text is not a device address.
 #[derive(Debug, thiserror::Error)]
 pub enum AddressError {
     /// It is not an address.

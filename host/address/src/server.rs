@@ -88,7 +88,7 @@ pub enum ServerError {
     /// An encrypted connection needs keys.
     #[cfg(feature = "tls")]
     #[error(
-        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or behind the address as ?keys=FOLDER/NAME"
+        "no keys are given: name them in CANTAP_KEYS as FOLDER/NAME, or after the address as ?keys=FOLDER/NAME"
     )]
     NoKeys,
     /// These cannot be the names of keys.
@@ -98,7 +98,7 @@ pub enum ServerError {
     /// The encrypted connection could not be established.
     #[cfg(feature = "tls")]
     #[error(
-        "'{server}' lets nobody in with these keys, or is not there; they and the server's must be of one authority"
+        "'{server}' lets nobody in with these keys, or is not there; they and the server's must be from the same authority"
     )]
     Tls {
         /// As addressed.
@@ -193,10 +193,12 @@ fn with_port(place: &str) -> Result<String, String> {
         Some(rest) => match rest.split_once(']') {
             Some((_, "")) => true,
             Some((_, rest)) if has_port(rest) => false,
-            _ => return Err(format!("'{place}' is no address; write it as [::1]:{PORT}")),
+            _ => return Err(format!("'{place}' is not an address; write it as [::1]:{PORT}")),
         },
         None if place.matches(':').count() > 1 => {
-            return Err(format!("'{place}' is no address; an IPv6 one stands in brackets, as [::1]:{PORT}"));
+            return Err(format!(
+                "'{place}' is not an address; an IPv6 address needs brackets, as [::1]:{PORT}"
+            ));
         }
         None if place.contains(':') && !has_port(place) => {
             return Err(format!("'{place}' has no port number behind its colon; write it as HOST:{PORT}"));
@@ -223,7 +225,9 @@ impl Ssh {
         let name = host.rsplit_once('@').map_or(host, |(_, name)| name);
         // ssh would take anything that begins with a dash as an option.
         if name.is_empty() || name.starts_with('-') || host.starts_with(['-', '@']) {
-            return Err(format!("'{host}' is no name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"));
+            return Err(format!(
+                "'{host}' is not the name of a computer; write it as ssh://[USER@]HOST[/DEVICE]"
+            ));
         }
         Ok(Self { host: host.to_owned(), device, allow })
     }

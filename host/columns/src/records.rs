@@ -28,7 +28,7 @@ pub enum BadColumns {
         found: String,
     },
     /// A row contains something that a trace cannot hold.
-    #[error("row {row} is no {what}")]
+    #[error("row {row} is not {what}")]
     Row {
         /// The row's index in its batch, from 0.
         row: usize,
@@ -149,27 +149,27 @@ impl<'a> Columns<'a> {
     fn record(&self, row: usize) -> Result<TraceRecord, BadColumns> {
         let bad = |what| BadColumns::Row { row, what };
         if self.time.is_null(row) || self.channel.is_null(row) {
-            return Err(bad("record: it has no time or no channel"));
+            return Err(bad("a valid record: it has no time or no channel"));
         }
-        let event = self.event.at(row).ok_or(bad("record: it does not say what happened"))?;
+        let event = self.event.at(row).ok_or(bad("a valid record: it does not say what happened"))?;
         let detail = self.detail.at(row);
         let count = self.count.is_valid(row).then(|| self.count.value(row));
         let event = match event {
-            FRAME => self.frame(row).ok_or(bad("frame"))?,
+            FRAME => self.frame(row).ok_or(bad("a valid frame"))?,
             LOST => {
                 let stage =
-                    detail.map(|detail| item(&LOSS_STAGES, detail).ok_or(bad("known place of a loss")));
+                    detail.map(|detail| item(&LOSS_STAGES, detail).ok_or(bad("a known place of a loss")));
                 let at_least = self.at_least.is_valid(row) && self.at_least.value(row);
                 TraceEvent::Lost { stage: stage.transpose()?, count: count.unwrap_or(0), at_least }
             }
             BUS_ERROR => {
-                let kind = detail.map(|detail| item(&BUS_ERRORS, detail).ok_or(bad("known bus error")));
+                let kind = detail.map(|detail| item(&BUS_ERRORS, detail).ok_or(bad("a known bus error")));
                 TraceEvent::BusError { kind: kind.transpose()?, counters: self.counters(row) }
             }
             SUPPRESSED => TraceEvent::ErrorsSuppressed { count: count.unwrap_or(0) },
             STATE => {
                 let state = detail.and_then(|detail| item(&ERROR_STATES, detail));
-                TraceEvent::State { state: state.ok_or(bad("known state"))?, counters: self.counters(row) }
+                TraceEvent::State { state: state.ok_or(bad("a known state"))?, counters: self.counters(row) }
             }
             TRANSMIT_FAILED => {
                 let tag = if self.tag.is_valid(row) { self.tag.value(row) } else { 0 };
@@ -177,9 +177,9 @@ impl<'a> Columns<'a> {
                     Some(OVERTAKEN) => Some(TransmitFailure::Overtaken { periods: count.unwrap_or(1) }),
                     detail => detail.and_then(|detail| item(&TRANSMIT_FAILURES, detail)),
                 };
-                TraceEvent::TransmitFailed { tag, reason: reason.ok_or(bad("known failure"))? }
+                TraceEvent::TransmitFailed { tag, reason: reason.ok_or(bad("a known failure"))? }
             }
-            _ => return Err(bad("known kind of record")),
+            _ => return Err(bad("a known kind of record")),
         };
         Ok(TraceRecord { time_ns: self.time.value(row), channel: self.channel.value(row), event })
     }

@@ -157,9 +157,9 @@ mod tests {
             [
                 "test, line 7: expected 2 data bytes, found '11'",
                 "test, line 8: expected a data length code of 0 to F, found '40'",
-                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF with x behind it, found '12345678'",
+                "test, line 9: expected an identifier up to 7FF, or up to 1FFFFFFF followed by x, found '12345678'",
                 "test, line 10: expected a line that begins with a time in seconds, found 'rubbish'",
-                "test, line 11: expected 'd' or 'r' behind the direction, found nothing",
+                "test, line 11: expected 'd' or 'r' after the direction, found nothing",
                 "test, line 12: expected 1 data bytes, found '1G'",
                 "test, line 14: the file ends inside a line; everything before it was read",
             ]

@@ -9,7 +9,7 @@ use super::zone::Zone;
 use cantap_trace::{Direction, TraceRecord};
 
 const MINUTES: &str =
-    "times begin anew each minute: of a pause of more than a minute only the seconds are known";
+    "times restart each minute: for a pause of more than a minute, only the seconds are known";
 
 const NS_PER_MINUTE: i64 = 60 * NS_PER_S;
 

@@ -84,7 +84,7 @@ impl Decoder {
         let direction = match *direction {
             b"R" => Direction::Rx,
             b"T" => Direction::Tx,
-            other => return Err(Fault::malformed("'R' or 'T' behind the time", other)),
+            other => return Err(Fault::malformed("'R' or 'T' after the time", other)),
         };
         let record = |event| TraceRecord { time_ns, channel, event };
         if flags.eq_ignore_ascii_case(b"ErrorFrame") || flags.eq_ignore_ascii_case(b"XErrorFrame") {

@@ -14,7 +14,7 @@ pub(crate) const BATCH: usize = 256;
 
 /// Name of the rows and objects that Vector's programs write before they send a frame.
 pub(crate) const REQUESTS_TO_SEND: &str =
-    "requests to send were passed over: what was sent is in the trace again as sent";
+    "requests to send were skipped: what was sent is in the trace as sent";
 
 /// The reading half of a format.
 pub(crate) trait Decode: Send {

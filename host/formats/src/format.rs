@@ -93,7 +93,7 @@ const FORMATS: &[(Format, &[&str], &[&str])] = &[
 #[non_exhaustive]
 pub enum UnknownFormat {
     /// Not a format's name.
-    #[error("'{0}' is no trace format; the formats are {known}", known = Format::names())]
+    #[error("'{0}' is not a trace format; the formats are {known}", known = Format::names())]
     Name(String),
     /// A file's suffix does not name a format.
     #[error("the name '{0}' does not tell the format")]

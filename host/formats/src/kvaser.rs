@@ -101,7 +101,7 @@ impl RowFormat for Decoder {
     }
 
     fn missing(&self) -> Option<&'static str> {
-        (!self.in_rows).then_some("a line of '=' below the names of columns, and rows behind it")
+        (!self.in_rows).then_some("a line of '=' below the names of columns, followed by rows")
     }
 
     fn note(&mut self) -> Option<&'static str> {

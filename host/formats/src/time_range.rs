@@ -17,7 +17,7 @@ pub enum TimePoint {
 /// Not a point in time.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
-    "'{0}' is no time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
+    "'{0}' is not a time; write seconds from the first record (12.5, or 90s, 10m, 2h), seconds since 1970 \
      (1410714882.5), or a date in UTC (2014-09-14T17:14:42)"
 )]
 pub struct BadTime(String);

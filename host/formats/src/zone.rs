@@ -18,7 +18,7 @@ pub struct Zone(Option<TimeZone>);
 
 /// This is not a time zone.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("'{0}' is no time zone; write a name such as Europe/Berlin, an offset such as +02:00, or UTC")]
+#[error("'{0}' is not a time zone; write a name such as Europe/Berlin, an offset such as +02:00, or UTC")]
 pub struct UnknownZone(String);
 
 impl Zone {

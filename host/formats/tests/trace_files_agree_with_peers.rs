@@ -406,8 +406,8 @@ const DIFFERENT: &[(&str, &str)] = &[
     ("test_CanFdMessage64.blf", "an identifier of 31 bits is an issue here"),
     ("test_CanFdRemoteMessage.asc", "a remote frame in a CANFD row is a classical one"),
     ("test_CanMessage.asc.gz", "the date has PM behind it, which python-can does not read"),
-    ("test_CanMessage.blf", "a mere request to send is no frame on the bus"),
-    ("test_CanMessage2.blf", "a mere request to send is no frame on the bus"),
+    ("test_CanMessage.blf", "a mere request to send is not a frame on the bus"),
+    ("test_CanMessage2.blf", "a mere request to send is not a frame on the bus"),
     ("test_CanMessage_V1_0_BUS1.trc", "python-can does not read the date of version 1.0"),
 ];
 

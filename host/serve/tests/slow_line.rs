@@ -1,4 +1,4 @@
-//! A client behind a line that carries less than its buses do: it loses, counted, and its requests are answered in time all the same.
+//! A client on a line that carries less than its buses do: it loses frames, counted, and its requests are still answered in time.
 #![cfg(unix)]
 
 mod line;
@@ -14,11 +14,11 @@ use cantap_serve::{Board, Settings, listen};
 use line::SlowLine;
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// Two saturated channels take 210 000.
+/// Two saturated channels need 210 000.
 const BYTES_PER_S: usize = 80_000;
 const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
 
-/// Answers go before records that wait, unless the system has those already.
+/// Answers go before waiting records, unless the system already has those.
 #[test]
 fn requests_over_a_slow_line_are_answered_in_time() {
     let connect =
@@ -35,7 +35,7 @@ fn requests_over_a_slow_line_are_answered_in_time() {
     for channel in Channel::ALL {
         device.listen(channel, BITRATE_BPS).unwrap();
     }
-    // Until all that can wait on the way waits.
+    // Until everything on the way is full.
     std::thread::sleep(Duration::from_secs(3));
     for _ in 0..3 {
         device.status().unwrap();

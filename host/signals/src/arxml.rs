@@ -259,7 +259,7 @@ impl<'a> Reader<'a> {
             "CONTAINER-I-PDU" => {
                 let name = short_name(pdu);
                 let reason = format!(
-                    "{name} is a container PDU: what a frame holds stands in the frame itself, and is not read"
+                    "{name} is a container PDU: the frame itself says what it contains, which is not read"
                 );
                 self.warn(pdu, target.name, &reason);
                 Ok(())
@@ -517,7 +517,7 @@ fn compute(method: Node<'_, '_>, signal: &mut Signal) -> Result<(), FaultKind> {
             continue;
         }
         let (&[offset, factor], [divisor]) = (&numerator[..], &denominator[..]) else {
-            return Err(FaultKind::Syntax(format!("{} is no linear computation", short_name(method))));
+            return Err(FaultKind::Syntax(format!("{} is not a linear computation", short_name(method))));
         };
         let found = (factor / divisor, offset / divisor);
         if line.replace(found).is_some_and(|before| before != found) {

@@ -18,7 +18,7 @@ pub enum DatabaseError {
     },
     /// The suffix does not belong to any kind of database.
     #[error(
-        "{file} is no known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
+        "{file} is not a known kind of database; use a .dbc, .kcd, .sym or .arxml file, or a .toml signal file (docs/signal-file.md)"
     )]
     UnknownKind {
         /// The file.
@@ -110,7 +110,7 @@ pub enum FaultKind {
     /// The factor is zero.
     #[error("the factor is 0, so that every value is the offset")]
     ZeroFactor,
-    /// Factor or offset is no finite number.
+    /// Factor or offset is not a finite number.
     #[error("factor {factor} and offset {offset} make no value")]
     Scale {
         /// The factor.

@@ -69,7 +69,7 @@ fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<M
     let mut fault = |kind| faults.push(Fault { line, symbol: name.clone(), kind });
     let written = node.attribute("id").unwrap_or_default();
     let Some(number) = xml::integer(written) else {
-        fault(FaultKind::Syntax(format!("the identifier {written:?} is no number")));
+        fault(FaultKind::Syntax(format!("the identifier {written:?} is not a number")));
         return None;
     };
     let extended = node.attribute("format") == Some("extended");
@@ -114,8 +114,8 @@ fn multiplex(document: &Document, node: Node, signals: &mut Vec<Signal>) -> Resu
     for group in node.children().filter(|node| node.has_tag_name_of("MuxGroup")) {
         let written = group.attribute("count").unwrap_or_default();
         let value = xml::integer(written).and_then(|value| u64::try_from(value).ok());
-        let value =
-            value.ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is no number")))?;
+        let value = value
+            .ok_or_else(|| FaultKind::Syntax(format!("the group's count {written:?} is not a number")))?;
         for part in group.children().filter(|node| node.has_tag_name_of("Signal")) {
             let multiplexed = Some(Multiplexed { switch, values: vec![value..=value] });
             signals.push(Signal { multiplexed, ..signal(document, part)? });
@@ -130,7 +130,7 @@ fn signal(document: &Document, node: Node) -> Result<Signal, FaultKind> {
         Some(text) => text
             .trim()
             .parse::<f64>()
-            .map_err(|_| FaultKind::Syntax(format!("{name} = {text:?} is no number"))),
+            .map_err(|_| FaultKind::Syntax(format!("{name} = {text:?} is not a number"))),
     };
     let name = node.attribute("name").unwrap_or_default();
     let offset = number(node, "offset", 0.0)? as u64;

@@ -68,12 +68,12 @@ impl IdPattern {
 pub enum PatternError {
     /// Not an identifier.
     #[error(
-        "{0:?} is no identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
+        "{0:?} is not an identifier; write up to 3 hexadecimal digits, or up to 8 (29 bits), with ? for any digit, or LOW-HIGH"
     )]
     Id(String),
     /// Not data.
     #[error(
-        "{0:?} is no byte; write hexadecimal digits in pairs such as 1F, 3? or ??, and * for any number of bytes"
+        "{0:?} is not a byte; write hexadecimal digits in pairs such as 1F, 3? or ??, and * for any number of bytes"
     )]
     Data(String),
 }
@@ -123,7 +123,7 @@ impl FromStr for IdPattern {
 }
 
 /// Data bytes from the first on, such as `11 ?? 3?`; the bytes after them may be anything. A leading `*`
-/// finds them anywhere; between bytes, it stands for any number of bytes.
+/// finds them anywhere; between bytes, it means any number of bytes.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct DataPattern {
     /// Each is found somewhere after the one before. Value and mask per byte.

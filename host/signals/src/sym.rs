@@ -306,7 +306,7 @@ impl Reader {
             let Some((option, value)) = word.split_once(':') else { continue };
             let number = || {
                 let value = value.parse::<f64>();
-                value.map_err(|_| FaultKind::Syntax(format!("{word} of {name} is no number")))
+                value.map_err(|_| FaultKind::Syntax(format!("{word} of {name} is not a number")))
             };
             match option {
                 "/u" => value.clone_into(&mut signal.unit),

@@ -108,7 +108,7 @@ fn a_text_of_several_values_means_all_of_them() {
     assert_eq!(error, "\"Drive\" stands for several values of Gear; choose one: raw:255, raw:3, raw:7");
     assert_eq!(encode::encode(&decoder, None, "Box:Gear=raw:255").unwrap().frame.to_string(), "005#FF00");
     let error = encode::encode(&decoder, None, "Box:Gear=Reverse").unwrap_err().to_string();
-    assert_eq!(error, "\"Reverse\" is no value for Gear; it takes a number or one of: Drive, Park");
+    assert_eq!(error, "\"Reverse\" is not a value for Gear; it takes a number or one of: Drive, Park");
 }
 
 #[test]

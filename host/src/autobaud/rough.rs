@@ -2,7 +2,7 @@
 //! frame, and on a bad bus every frame may be destroyed.
 //!
 //! What remains are distances from one edge to the next of the same kind, each a whole number of bits, ten at most. The bit time is the
-//! one that they are all multiples of and at which single bits occur. That is no proof, so the result counts only if the controller then
+//! one that they are all multiples of and at which single bits occur. That is not proof, so the result counts only if the controller then
 //! receives frames.
 
 use super::measure::{Measured, ROUNDING_TICKS};

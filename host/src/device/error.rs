@@ -167,7 +167,7 @@ pub enum DeviceError {
 pub enum SessionOver {
     /// The device reports that the computer suspended it.
     Suspended,
-    /// The device reports that the computer configured it anew.
+    /// The device reports that the computer configured it again.
     Configured,
     /// The device refuses requests because there is no session.
     Refused,
@@ -197,13 +197,13 @@ impl fmt::Display for SessionOver {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(match self {
             Self::Suspended => "this computer put the device to sleep, as when it sleeps itself",
-            Self::Configured => "this computer set the device up anew, as when its driver is loaded again",
+            Self::Configured => "this computer configured the device again, as when its driver is reloaded",
             Self::Refused => {
                 "this computer slept, or the device was restarted, or another program took it over"
             }
             Self::Greeted => "another program took it over; close that program",
             Self::StreamWentBack => {
-                "its stream began anew, because another program took it over or it was restarted"
+                "its stream started over, because another program took it over or it was restarted"
             }
             Self::TimesDisagree => {
                 "its times contradict one another, so its last stamps may be wrong; if that stays so, update its firmware"

@@ -24,8 +24,7 @@ const PATIENCE: Duration = Duration::from_millis(100);
 /// How long to sleep while nothing comes.
 const NAP: Duration = Duration::from_millis(2);
 
-/// The number from 1, as in records and words, of a channel of one of several devices, which are counted from
-/// 0.
+/// The number (from 1, as in records and words) of a channel of one of several devices (counted from 0).
 pub const fn channel_number(device: usize, channel: Channel) -> u8 {
     (device * CHANNELS) as u8 + channel.number()
 }

@@ -34,7 +34,7 @@ pub enum Fault {
     /// It was suspended and resumed: after its captured frames it reports that the session has ended. Its last batch is
     /// lost.
     Suspended,
-    /// It was configured anew: at the next request it delivers its captured frames, reports that the session has ended, and
+    /// It was configured again: at the next request it delivers its captured frames, reports that the session has ended, and
     /// refuses. Its last batch is lost.
     Configured,
     /// Another program has greeted it and now has the session.

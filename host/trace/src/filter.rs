@@ -55,11 +55,11 @@ pub enum ParseFilterError {
     Interface(String),
     /// Neither an ID nor an ID with a mask.
     #[error(
-        "'{0}' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else"
+        "'{0}' is not a filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else"
     )]
     Element(String),
     /// A number.
-    #[error("'{0}' is no hexadecimal number of up to 8 digits")]
+    #[error("'{0}' is not a hexadecimal number of up to 8 digits")]
     Number(String),
 }
 
@@ -288,16 +288,16 @@ mod tests {
         for (text, message) in [
             (
                 "can0,x",
-                "'x' is no filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else",
+                "'x' is not a filter; write ID, such as 123 or 09F80102, ID:MASK, such as 120:7F0, or ID~MASK for everything else",
             ),
             (
                 "x",
                 "'x' is neither an ID, such as 123, 123:7FF or 09F80102, nor an interface, such as can0 for channel 1, can1 for channel 2, \
                  or any",
             ),
-            ("can0,12G:7FF", "'12G' is no hexadecimal number of up to 8 digits"),
-            ("can0,#", "'' is no hexadecimal number of up to 8 digits"),
-            ("can0,+1:7FF", "'+1' is no hexadecimal number of up to 8 digits"),
+            ("can0,12G:7FF", "'12G' is not a hexadecimal number of up to 8 digits"),
+            ("can0,#", "'' is not a hexadecimal number of up to 8 digits"),
+            ("can0,+1:7FF", "'+1' is not a hexadecimal number of up to 8 digits"),
         ] {
             assert_eq!(text.parse::<Filter>().unwrap_err().to_string(), message);
         }

@@ -53,7 +53,7 @@ pub struct Alignment {
 #[non_exhaustive]
 pub enum AlignError {
     /// Hardly any run of frames is in both.
-    #[error("no stretch of the one is found in the other: did both hear the same bus at the same time?")]
+    #[error("no part of one is found in the other: did both record the same bus at the same time?")]
     NothingInCommon,
     /// The times of what both have do not agree.
     #[error("the same frames are in both, but their times do not fit together")]

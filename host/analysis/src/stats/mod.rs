@@ -76,7 +76,7 @@ fn of_channel(rates: &[(u8, u32)], channel: u8) -> Option<u32> {
 #[non_exhaustive]
 pub enum BadOptions {
     /// A bit rate of zero.
-    #[error("a bit rate of 0 bit/s is no bit rate; give one such as 500k")]
+    #[error("a bit rate of 0 bit/s is impossible; give one such as 500k")]
     ZeroBitrate,
     /// A window that is shorter than a frame.
     #[error(

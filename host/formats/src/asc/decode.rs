@@ -169,10 +169,10 @@ impl Decoder {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
             b"TxRq" => return Ok(OnChannel::Request),
-            _ => return Err(Fault::malformed("'Rx' or 'Tx' behind the identifier", word)),
+            _ => return Err(Fault::malformed("'Rx' or 'Tx' after the identifier", word)),
         };
         let id = if extended { Id::extended(raw) } else { Id::standard(raw) }.ok_or_else(|| {
-            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", id)
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF followed by x", id)
         })?;
         let (kind, rest) = text::word(rest);
         let (dlc, rest) = text::word(rest);
@@ -191,7 +191,7 @@ impl Decoder {
                 let dlc = if dlc.len() == 1 { self.dlc(dlc)? } else { 0 };
                 Frame::from_bus(id, true, dlc, [0; 8])
             }
-            other => return Err(Fault::malformed("'d' or 'r' behind the direction", other)),
+            other => return Err(Fault::malformed("'d' or 'r' after the direction", other)),
         };
         Ok(OnChannel::Event(TraceEvent::Frame { frame: frame.into(), direction, late: false }))
     }
@@ -233,7 +233,7 @@ impl Decoder {
             b"Rx" => Direction::Rx,
             b"Tx" => Direction::Tx,
             b"TxRq" => return Ok(OnChannel::Request),
-            other => return Err(Fault::malformed("'Rx' or 'Tx' behind the channel", other)),
+            other => return Err(Fault::malformed("'Rx' or 'Tx' after the channel", other)),
         };
         let word = next();
         if word.eq_ignore_ascii_case(b"ErrorFrame") {
@@ -243,7 +243,7 @@ impl Decoder {
         let id =
             parsed.and_then(|(raw, extended)| if extended { Id::extended(raw) } else { Id::standard(raw) });
         let id = id.ok_or_else(|| {
-            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF with x behind it", word)
+            Fault::malformed("an identifier up to 7FF, or up to 1FFFFFFF followed by x", word)
         })?;
         // An optional symbolic name, then BRS, ESI, DLC, data length, data, duration, bits, flags.
         let flag = |word: &[u8]| match word {
@@ -255,7 +255,7 @@ impl Decoder {
         if flag(word).is_none() {
             word = next();
         }
-        let expected = "BRS and ESI as 0 or 1, a length code and a number of bytes behind the identifier";
+        let expected = "BRS and ESI as 0 or 1, a length code and a number of bytes after the identifier";
         let brs = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;
         let word = next();
         let esi = flag(word).ok_or_else(|| Fault::malformed(expected, word))?;

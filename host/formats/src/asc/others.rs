@@ -49,7 +49,7 @@ pub(super) fn kind(line: &[u8]) -> Result<Content, Fault> {
     if text::word(rest).0 == b":=" {
         return Ok(Content::LeftOut("environment and system variables"));
     }
-    let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC behind the time";
+    let expected = "a channel of 0 to 255, CAN, CANFD, or another event of ASC after the time";
     Err(Fault::malformed(expected, line))
 }
 

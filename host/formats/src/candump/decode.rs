@@ -167,7 +167,7 @@ impl Decoder {
         let direction = match rest.trim_ascii() {
             b"" | b"R" | b"r" => Direction::Rx,
             b"T" | b"t" => Direction::Tx,
-            other => return Err(Fault::malformed("'R', 'T' or nothing behind the frame", other)),
+            other => return Err(Fault::malformed("'R', 'T' or nothing after the frame", other)),
         };
         let raw = text::hex(id).ok_or_else(|| Fault::malformed("a hexadecimal identifier", id))?;
         let channel = self.interfaces.channel(interface);

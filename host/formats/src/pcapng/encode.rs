@@ -170,7 +170,7 @@ fn loss(stage: Option<LossStage>, count: u32, at_least: bool) -> String {
         None => "",
     };
     match (count, at_least) {
-        (0, true) => format!("frames were lost here{place}, nobody knows how many"),
+        (0, true) => format!("an unknown number of frames was lost here{place}"),
         (1, false) => format!("1 frame was lost here{place}"),
         (count, true) => format!("at least {count} frames were lost here{place}"),
         (count, false) => format!("{count} frames were lost here{place}"),

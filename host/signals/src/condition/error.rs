@@ -34,7 +34,7 @@ pub enum ConditionFault {
     #[error("this text has no closing quote")]
     OpenText,
     /// Not a number.
-    #[error("{0:?} is no number")]
+    #[error("{0:?} is not a number")]
     Number(String),
     /// `a < b < c`.
     #[error("comparisons cannot be chained; write \"a < b and b < c\"")]
@@ -51,7 +51,7 @@ pub enum ConditionFault {
         near: Suggestion,
     },
     /// An unknown name, because no database was loaded.
-    #[error("{0:?} is no part of a frame, and without a database there are no signals")]
+    #[error("{0:?} is not part of a frame, and without a database there are no signals")]
     NoDatabase(String),
     /// A text where it cannot be compared.
     #[error("a text can only be compared with a signal, by == or !=")]

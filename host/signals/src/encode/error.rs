@@ -7,7 +7,7 @@ use crate::select::Suggestion;
 #[non_exhaustive]
 pub enum EncodeError {
     /// The text does not have the expected form.
-    #[error("{text:?} is no message with values; write it as Message:Signal=value,Signal=value")]
+    #[error("{text:?} is not a message with values; write it as Message:Signal=value,Signal=value")]
     Form {
         /// The text.
         text: String,
@@ -43,8 +43,8 @@ pub enum EncodeError {
     /// The signal is given twice.
     #[error("signal {0} is given twice")]
     Twice(String),
-    /// The text is no number and not in the value table.
-    #[error("{text:?} is no value for {signal}; it takes a number{choices}")]
+    /// The text is not a number and not in the value table.
+    #[error("{text:?} is not a value for {signal}; it takes a number{choices}")]
     UnknownText {
         /// The signal.
         signal: String,
@@ -87,7 +87,7 @@ pub enum EncodeError {
     },
     /// The database forbids the value.
     #[error(
-        "the database allows {signal} from {low} to {high}, not {value}; write raw:{raw} to send it all the same"
+        "the database allows {signal} from {low} to {high}, not {value}; write raw:{raw} to send it anyway"
     )]
     Limits {
         /// The signal.

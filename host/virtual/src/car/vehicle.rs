@@ -1,6 +1,6 @@
 //! The car's physics: a driver who follows a drive cycle, an engine, a gearbox, wheels, temperatures, a body.
 //!
-//! Everything moves in steps of 10 ms, so that it is the same whoever looks at it, and whenever. This module knows
+//! Everything moves in steps of 10 ms, so it is the same for every reader at any time. This module knows
 //! nothing about frames.
 
 use std::f64::consts::PI;

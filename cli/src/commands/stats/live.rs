@@ -96,9 +96,7 @@ impl Lines {
             eprintln!("{}", line(window, self.colour));
         }
     }
-}
 
-impl Lines {
     /// The window in which listening ended is truncated: channels end a little apart, and earlier errors are counted in it, so its rates
     /// would make a steady bus look unsteady. It is shown only if there is no other.
     fn is_worth_a_line(&mut self, window: &Window) -> bool {

@@ -10,11 +10,11 @@ use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
 use cantap_columns::parquet::ParquetFile;
-use cantap_columns::{FrameColumns, MessageColumns};
+use cantap_columns::{FrameColumns, MessageTables};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, Message, Selection, SignalValue};
+use cantap_signals::{Decoder, Message, Selection};
 use pyo3::prelude::*;
 
 use crate::database::Database;
@@ -85,67 +85,12 @@ pub fn stats(
     from_json(py, &summary.to_string())
 }
 
-/// Records that become a table for each message, and one of what happened beside frames.
-struct PerMessage {
-    decoder: Arc<Decoder>,
-    /// Of chosen signals only: a message without any of them counts for nothing.
-    chosen: Option<Selection>,
-    /// By [`MessageRef::index`](cantap_signals::MessageRef::index).
-    tables: Vec<Option<Box<MessageColumns>>>,
-    events: FrameColumns,
-    values: Vec<SignalValue>,
-    /// Frames of messages.
-    decoded: u64,
-}
-
 /// What Python's half makes a mapping of: tables by name, and the events.
 type Tables = (Vec<(String, Table)>, Table);
 
-impl PerMessage {
-    fn new(decoder: Arc<Decoder>, signals: &[String]) -> Result<Self, Error> {
-        let chosen = if signals.is_empty() { None } else { Some(Selection::new(signals)?) };
-        let tables = decoder.messages().map(|_| None).collect();
-        Ok(Self { decoder, chosen, tables, events: FrameColumns::default(), values: Vec::new(), decoded: 0 })
-    }
-
-    /// Appends a record.
-    fn push(&mut self, record: &cantap::TraceRecord) {
-        let Self { decoder, chosen, tables, events, values, decoded } = self;
-        let Some(frame) = record.frame() else {
-            events.push(record);
-            return;
-        };
-        if frame.is_remote() {
-            return;
-        }
-        let Some(reference) = decoder.find(record.channel, frame.id()) else { return };
-        if chosen.is_some() && !decoder.is_selected(reference) {
-            return;
-        }
-        let table = &mut tables[reference.index()];
-        let table = table.get_or_insert_with(|| Box::new(MessageColumns::new(decoder, reference)));
-        if chosen.is_some() && !table.has_value(frame) {
-            // Whether it has one of the signals depends on its bytes.
-            values.clear();
-            decoder.decode_data(reference, frame.data(), values);
-            if values.is_empty() {
-                return;
-            }
-            table.push_values(record, values);
-        } else {
-            table.push(record);
-        }
-        *decoded += 1;
-    }
-
-    /// How many frames were decoded, and how many values they had.
-    fn counts(&mut self) -> (u64, u64) {
-        (self.decoded, self.tables.iter_mut().flatten().map(|table| table.values()).sum())
-    }
-
-    fn finish(mut self) -> Tables {
-        (named(&self.decoder, self.tables, self.chosen.as_ref()), Table::of_batch(self.events.take()))
-    }
+/// What was chosen, if anything was.
+fn selection(signals: &[String]) -> Result<Option<Selection>, Error> {
+    Ok(if signals.is_empty() { None } else { Some(Selection::new(signals)?) })
 }
 
 /// A trace as a table for each message, and one of what happened beside frames.
@@ -153,14 +98,24 @@ impl PerMessage {
 pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
     let decoder =
         options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
-    let mut tables = PerMessage::new(decoder, &options.signals)?;
+    let chosen = selection(&options.signals)?;
+    let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     let report = Report::default();
-    walk(py, &options, &report, |record| {
-        tables.push(record);
-        Ok(())
-    })?;
+    let for_source = report.clone();
+    let mut source = py.detach(|| TraceSource::open(&options, for_source))?;
+    let (mut frames, mut records) = (Vec::new(), Vec::new());
+    while py.detach(|| -> Result<bool, Error> {
+        let more = source.next_mixed(&mut frames, &mut records)?;
+        tables.push_frames(&frames);
+        records.iter().for_each(|record| tables.push(record));
+        Ok(more)
+    })? {
+        py.check_signals()?;
+    }
+    source.tell();
+    warn(py, &report)?;
     report.set_decoded(py.detach(|| tables.counts()));
-    Ok((tables.finish(), Py::new(py, report)?))
+    Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, report)?))
 }
 
 /// The same of a table of records.
@@ -171,7 +126,9 @@ pub fn decode_table(
     db: Py<Database>,
     signals: Vec<String>,
 ) -> PyResult<Tables> {
-    let mut tables = PerMessage::new(db.get().selecting(&signals)?, &signals)?;
+    let decoder = db.get().selecting(&signals)?;
+    let chosen = selection(&signals)?;
+    let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     for batch in batches_of(table)? {
         py.detach(|| -> Result<(), Error> {
             for record in records_of(batch)? {
@@ -181,19 +138,15 @@ pub fn decode_table(
         })?;
         py.check_signals()?;
     }
-    Ok(tables.finish())
+    Ok(finish(&decoder, tables, chosen.as_ref()))
 }
 
 /// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
-fn named(
-    decoder: &Decoder,
-    mut tables: Vec<Option<Box<MessageColumns>>>,
-    chosen: Option<&Selection>,
-) -> Vec<(String, Table)> {
+fn finish(decoder: &Decoder, tables: MessageTables, chosen: Option<&Selection>) -> Tables {
+    let (tables, mut events) = tables.finish();
     let mut named: Vec<(String, Table)> = Vec::new();
-    for (reference, channel, message) in decoder.messages() {
-        let table = tables[reference.index()].take().filter(|table| table.rows() > 0);
-        let Some(mut table) = table else { continue };
+    for (reference, mut table) in tables {
+        let (channel, message) = (decoder.channel(reference), decoder.message(reference));
         let mut name = message.name.clone();
         if named.iter().any(|(other, _)| *other == name) {
             name = format!("{name}-{}", message.id);
@@ -205,7 +158,7 @@ fn named(
         let batch = chosen.map_or_else(|| batch.clone(), |chosen| only(&batch, message, chosen));
         named.push((name, Table::of_batch(batch)));
     }
-    named
+    (named, Table::of_batch(events.take()))
 }
 
 /// The columns of time, channel and identifier, and those of the chosen signals.

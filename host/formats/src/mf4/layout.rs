@@ -62,6 +62,7 @@ impl Field {
         self.bits_of(record, big_endian)
     }
 
+    #[inline]
     fn bits_of(&self, record: &[u8], big_endian: bool) -> Option<u64> {
         if self.bits == 0 || self.bits > 64 {
             return None;
@@ -81,6 +82,25 @@ impl Field {
         Some((all >> self.bit) as u64 & mask)
     }
 
+    /// Where its number stands in each record of this length; `None` where [`Self::unsigned`] has more to do than to look there.
+    pub(super) fn place(&self, record_bytes: usize) -> Option<Place> {
+        let Kind::Integer { big_endian: false, .. } = self.kind else { return None };
+        let end = u32::from(self.bit) + self.bits;
+        let is_inside = self.at.checked_add(end.div_ceil(8) as usize)? <= record_bytes;
+        let is_word = self.bits > 0 && end <= 64;
+        (is_inside && is_word).then(|| Place {
+            at: self.at,
+            bit: self.bit,
+            mask: u64::MAX >> (64 - self.bits),
+        })
+    }
+
+    /// Where its bytes begin, and how many there are; `None` if not all are inside a record of this length.
+    pub(super) fn span(&self, record_bytes: usize) -> Option<(usize, usize)> {
+        let len = self.bits as usize / 8;
+        (self.at.checked_add(len)? <= record_bytes).then_some((self.at, len))
+    }
+
     /// Whether a flag is set, or a text says what the flag stands for.
     pub(super) fn flag(&self, record: &[u8], text: &[u8]) -> bool {
         match self.kind {
@@ -92,6 +112,7 @@ impl Field {
     }
 
     /// A signed integer, exactly.
+    #[inline]
     fn signed(&self, record: &[u8]) -> Option<i64> {
         let Kind::Integer { big_endian, signed } = self.kind else { return None };
         let bits = self.bits_of(record, big_endian)?;
@@ -107,6 +128,26 @@ impl Field {
             64 => Some(f64::from_bits(bits)),
             _ => None,
         }
+    }
+}
+
+/// Where a number stands, in a word of eight bytes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    at: usize,
+    bit: u8,
+    mask: u64,
+}
+
+impl Place {
+    /// So many bytes must be there behind the place.
+    pub(super) const BYTES: usize = 8;
+
+    /// The number; 0 if there are fewer bytes.
+    #[inline]
+    pub(super) fn get(&self, bytes: &[u8]) -> u64 {
+        let word = bytes.get(self.at..).and_then(<[u8]>::first_chunk);
+        word.map_or(0, |word| u64::from_le_bytes(*word) >> self.bit & self.mask)
     }
 }
 
@@ -132,6 +173,7 @@ impl Clock {
     }
 
     /// Nanoseconds since the start of the measurement.
+    #[inline]
     pub(super) fn ns(&self, record: &[u8], number: u64) -> Option<i64> {
         let integer = match &self.field {
             None => i64::try_from(number).ok(),

@@ -6,8 +6,8 @@ use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
 
-/// Plain data is read in pieces of this many bytes.
-const PIECE_BYTES: u64 = 1 << 20;
+/// Plain data is read in pieces of this many bytes: they stay in the processor's cache until they have been gone through.
+const PIECE_BYTES: u64 = 1 << 18;
 
 /// The standard has at most 4 MiB in a compressed block; other programs write more. Larger is damage.
 const MAX_UNPACKED_BYTES: u64 = 256 << 20;
@@ -155,6 +155,13 @@ impl Stream {
         Ok(self.buffer.get(from..from + len))
     }
 
+    /// The bytes from a place on that are at hand, perhaps none.
+    #[inline]
+    pub(super) fn held(&self, at: u64) -> &[u8] {
+        let from = at.checked_sub(self.buffer_start).and_then(|from| usize::try_from(from).ok());
+        from.and_then(|from| self.buffer.get(from..)).unwrap_or_default()
+    }
+
     /// Makes the buffer hold these bytes.
     fn load(&mut self, file: &mut Whole, at: u64, end: u64) -> Result<(), Fault> {
         let held_until = self.buffer_start + self.buffer.len() as u64;
@@ -174,14 +181,13 @@ impl Stream {
             }
             let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= loaded);
             let Some(piece) = self.pieces.get(holds).copied() else { return Ok(()) };
-            let bytes = if let Some(packed) = piece.packed {
-                unpack(file, piece, packed)?
+            if let Some(packed) = piece.packed {
+                self.buffer.extend_from_slice(&unpack(file, piece, packed)?);
             } else {
                 let within = loaded - piece.start;
                 let len = (piece.len - within).min(PIECE_BYTES);
-                file.read_at(piece.at + within, len as usize)?
-            };
-            self.buffer.extend_from_slice(&bytes);
+                file.append_at(piece.at + within, len as usize, &mut self.buffer)?;
+            }
         }
     }
 }

@@ -17,6 +17,7 @@ use cantap_signals::search::{DataPattern, IdPattern, Search};
 use cantap_signals::{Decoder, Message, Selection};
 use pyo3::prelude::*;
 
+use crate::ahead::Ahead;
 use crate::database::Database;
 use crate::error::Error;
 use crate::report::{Report, by_kind, from_json};
@@ -102,17 +103,17 @@ pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)
     let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     let report = Report::default();
     let for_source = report.clone();
-    let mut source = py.detach(|| TraceSource::open(&options, for_source))?;
-    let (mut frames, mut records) = (Vec::new(), Vec::new());
-    while py.detach(|| -> Result<bool, Error> {
-        let more = source.next_mixed(&mut frames, &mut records)?;
-        tables.push_frames(&frames);
-        records.iter().for_each(|record| tables.push(record));
-        Ok(more)
-    })? {
+    let mut ahead = py.detach(|| Ahead::read(TraceSource::open(&options, for_source)?))?;
+    let mut next = || -> Result<bool, Error> {
+        let Some(batch) = ahead.next()? else { return Ok(false) };
+        tables.push_frames(&batch.frames);
+        batch.records.iter().for_each(|record| tables.push(record));
+        ahead.give_back(batch);
+        Ok(true)
+    };
+    while py.detach(&mut next)? {
         py.check_signals()?;
     }
-    source.tell();
     warn(py, &report)?;
     report.set_decoded(py.detach(|| tables.counts()));
     Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, report)?))

@@ -172,8 +172,13 @@ impl MessageColumns {
         self.id.push(id.raw());
     }
 
+    /// How many values at most the frames have that wait for being decoded.
+    pub(crate) fn waiting_cells(&self) -> usize {
+        self.waiting.len() * self.signals.len()
+    }
+
     /// Decodes the frames that wait for it.
-    fn decode(&mut self) {
+    pub(crate) fn decode(&mut self) {
         if self.waiting.is_empty() {
             return;
         }

@@ -1,12 +1,17 @@
 //! A table for each message of a trace.
 
-use std::sync::Arc;
+use std::num::NonZero;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread;
 
 use cantap_signals::{Decoder, MessageRef, SignalValue};
 use cantap_trace::{PlainFrame, TraceRecord};
 
 use crate::frames::FrameColumns;
 use crate::messages::MessageColumns;
+
+/// With fewer values than this a thread takes longer to start than to decode them.
+const CELLS_PER_THREAD: usize = 1 << 16;
 
 /// A trace that is decoded into a table for each message, and one of what happened beside frames.
 pub struct MessageTables {
@@ -74,11 +79,36 @@ impl MessageTables {
 
     /// How many frames were decoded, and how many values they had.
     pub fn counts(&mut self) -> (u64, u64) {
+        self.decode();
         (self.decoded, self.tables.iter_mut().flatten().map(|table| table.values()).sum())
     }
 
+    /// Decodes all frames that wait for it, table by table, in as many threads as there are cores.
+    fn decode(&mut self) {
+        let mut tables: Vec<_> = self.tables.iter_mut().flatten().collect();
+        let cells: usize = tables.iter().map(|table| table.waiting_cells()).sum();
+        let cores = thread::available_parallelism().map_or(1, NonZero::get);
+        let threads = cores.min(cells / CELLS_PER_THREAD).min(tables.len()).max(1);
+        // The largest first, so that no thread begins with it when the others have ended.
+        tables.sort_unstable_by_key(|table| table.waiting_cells());
+        let tables = Mutex::new(tables);
+        let next = || tables.lock().unwrap_or_else(PoisonError::into_inner).pop();
+        let work = || {
+            while let Some(table) = next() {
+                table.decode();
+            }
+        };
+        thread::scope(|scope| {
+            for _ in 1..threads {
+                scope.spawn(work);
+            }
+            work();
+        });
+    }
+
     /// The tables that have rows, in the order of the decoder's messages, and the one of what happened beside frames.
-    pub fn finish(self) -> (Vec<(MessageRef, Box<MessageColumns>)>, FrameColumns) {
+    pub fn finish(mut self) -> (Vec<(MessageRef, Box<MessageColumns>)>, FrameColumns) {
+        self.decode();
         let Self { decoder, mut tables, events, .. } = self;
         let tables = decoder.messages().filter_map(|(reference, ..)| {
             let table = tables[reference.index()].take()?;

@@ -12,8 +12,8 @@ use cantap_trace::{PlainFrame, TraceRecord};
 /// Records decoded at a time: few enough to stay in the processor's cache.
 pub(crate) const BATCH: usize = 256;
 
-/// Plain frames decoded at a time, for the same reason.
-pub(crate) const PLAIN_BATCH: usize = 1024;
+/// Plain frames decoded at a time: more, because they may go to another thread.
+pub(crate) const PLAIN_BATCH: usize = 4096;
 
 /// Of the rows and objects that Vector's programs write before they send a frame.
 pub(crate) const REQUESTS_TO_SEND: &str =

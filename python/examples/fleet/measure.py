@@ -1,7 +1,8 @@
 """Measures the job on this machine: `python measure.py TRACE DATABASE --traces 20 40 80 --workers 2`.
 
-Fleets of these sizes are made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here. Prints seconds of
-the decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be compared.
+Fleets of these sizes are made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here, of one core each.
+Prints seconds of the decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be
+compared. What is not done within `--limit` seconds is given up, with exit code 1.
 """
 
 from __future__ import annotations
@@ -71,6 +72,19 @@ def make(folder: Path, trace: Path, database: Path, traces: int) -> None:
         shutil.copy(trace, vehicle / f"drive{number % 10}{suffixes}")
 
 
+def give_up_after(seconds: float, step: list[str]) -> None:
+    """Ends the program when its time is over, whatever Spark waits for."""
+
+    def end() -> None:
+        print(f"given up after {seconds:g} s, at: {step[-1]}", file=sys.stderr, flush=True)
+        # Spark's processes end when their pipe from here does.
+        os._exit(1)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+
+
 def main() -> int:
     """Measures once."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -78,14 +92,20 @@ def main() -> int:
     parser.add_argument("database", type=Path)
     parser.add_argument("--traces", type=int, nargs="+", default=[20, 40, 80])
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--limit", type=float, default=180.0, help="seconds for all of it [default: 180]")
     chosen = parser.parse_args()
     os.environ["PYSPARK_PYTHON"] = sys.executable
+    step = ["starting Spark"]
+    give_up_after(chosen.limit, step)
     with tempfile.TemporaryDirectory(prefix="cantap-fleet-") as name:
         folder = Path(name)
         processor = Processor()
         processor.start()
         spark = (
             SparkSession.builder.master(f"local-cluster[{chosen.workers},1,1024]")
+            # Workers here reach the driver whatever this machine's name stands for.
+            .config("spark.driver.host", "localhost")
+            .config("spark.sql.shuffle.partitions", str(2 * chosen.workers))
             .config("spark.ui.enabled", "false")
             .config("spark.ui.showConsoleProgress", "false")
             .getOrCreate()
@@ -94,6 +114,7 @@ def main() -> int:
         failed = 0
         # What a cluster does once is no part of it: workers that start, code that is compiled.
         for number, traces in enumerate((8, *chosen.traces)):
+            step.append(f"{traces} traces")
             fleet = folder / f"fleet{number}"
             fleet.mkdir()
             make(fleet, chosen.trace, chosen.database, traces)

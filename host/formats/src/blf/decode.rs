@@ -315,6 +315,7 @@ impl Decoder {
 
     /// The same for data frames alone.
     fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) {
+        frames.reserve(PLAIN_BATCH);
         let plain = self.classical().take_while(|frame| !frame.remote).take(PLAIN_BATCH);
         let plain =
             plain.map(|frame| PlainFrame::new(frame.time_ns, frame.channel, frame.id, frame.dlc, frame.data));

@@ -173,6 +173,7 @@ impl Opened {
 
     /// Appends plain frames, up to whatever else comes next.
     fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<()> {
+        frames.reserve(PLAIN_BATCH);
         while frames.len() < PLAIN_BATCH
             && let Some(Reverse((_, index))) = self.next.peek().copied()
             && let Some(Item::Record(record)) = &self.parts[index].next

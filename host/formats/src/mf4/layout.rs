@@ -172,8 +172,14 @@ impl Clock {
         Self { field, offset_s, factor_s, step_ns }
     }
 
+    /// Where a counter is that needs nothing but to be multiplied, and by what; [`Self::ns`] is for the others, and for what is too large.
+    pub(super) fn counter(&self, record_bytes: usize) -> Option<(Place, i64)> {
+        let field = self.field.as_ref()?;
+        let is_signed = matches!(field.kind, Kind::Integer { signed: true, .. });
+        Some((field.place(record_bytes).filter(|_| !is_signed || field.bits == 64)?, self.step_ns?))
+    }
+
     /// Nanoseconds since the start of the measurement.
-    #[inline]
     pub(super) fn ns(&self, record: &[u8], number: u64) -> Option<i64> {
         let integer = match &self.field {
             None => i64::try_from(number).ok(),

@@ -7,6 +7,8 @@ use cantap_wire::Id;
 /// Where a group has what a plain frame is made of. What [`BusGroup::record`] says of a record, in a few instructions.
 pub(super) struct Plain {
     clock: Clock,
+    /// Where the clock is a mere counter, and what it counts, in nanoseconds.
+    counter: Option<(Place, i64)>,
     start_ns: i64,
     bus: u8,
     bus_channel: Option<Place>,
@@ -33,6 +35,7 @@ impl Plain {
         let (bytes_at, most_bytes) = bytes.span(record_bytes)?;
         let plain = Self {
             clock: bus.clock,
+            counter: bus.clock.counter(record_bytes),
             start_ns,
             bus: bus.bus,
             bus_channel: place(&bus.bus_channel)?,
@@ -71,7 +74,12 @@ impl Plain {
             return None;
         }
         let data = bytes.get(self.bytes_at..)?.first_chunk()?;
-        let time_ns = self.start_ns.saturating_add(self.clock.ns(&bytes[..self.record_bytes], number)?);
+        let counted = self.counter.as_ref().and_then(|(place, step_ns)| {
+            // With its highest bit set it may be negative or too large.
+            i64::try_from(place.get(bytes)).ok()?.checked_mul(*step_ns)
+        });
+        let offset_ns = counted.or_else(|| self.clock.ns(&bytes[..self.record_bytes], number))?;
+        let time_ns = self.start_ns.saturating_add(offset_ns);
         Some(PlainFrame::new(time_ns, channel, id, len as u8, *data))
     }
 }

@@ -8,8 +8,10 @@ compared. What is not done within `--limit` seconds is given up, with exit code 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
+import signal
 import sys
 import tempfile
 import threading
@@ -28,6 +30,7 @@ class Processor(threading.Thread):
     def __init__(self) -> None:
         super().__init__(daemon=True)
         self._used: dict[tuple[int, str], float] = {}
+        self._below: set[int] = set()
         self._over = threading.Event()
 
     def run(self) -> None:
@@ -50,10 +53,18 @@ class Processor(threading.Thread):
         below = {os.getpid()}
         while more := {number for number, parent in parents.items() if parent in below} - below:
             below |= more
+        self._below = below
         for number in below & used.keys():
             # With its start: numbers are used again.
             start, seconds = used[number]
             self._used[number, start] = seconds
+
+    def kill(self) -> None:
+        """Ends the processes below this one at once."""
+        self.look()
+        for number in self._below - {os.getpid()}:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
 
     def seconds(self) -> float:
         """All of it so far."""
@@ -72,12 +83,14 @@ def make(folder: Path, trace: Path, database: Path, traces: int) -> None:
         shutil.copy(trace, vehicle / f"drive{number % 10}{suffixes}")
 
 
-def give_up_after(seconds: float, step: list[str]) -> None:
+def give_up_after(seconds: float, step: list[str], processor: Processor, folder: Path) -> None:
     """Ends the program when its time is over, whatever Spark waits for."""
 
     def end() -> None:
         print(f"given up after {seconds:g} s, at: {step[-1]}", file=sys.stderr, flush=True)
-        # Spark's processes end when their pipe from here does.
+        # Without a word: Spark would say at length what it thinks of it.
+        processor.kill()
+        shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
     timer = threading.Timer(seconds, end)
@@ -96,11 +109,11 @@ def main() -> int:
     chosen = parser.parse_args()
     os.environ["PYSPARK_PYTHON"] = sys.executable
     step = ["starting Spark"]
-    give_up_after(chosen.limit, step)
     with tempfile.TemporaryDirectory(prefix="cantap-fleet-") as name:
         folder = Path(name)
         processor = Processor()
         processor.start()
+        give_up_after(chosen.limit, step, processor, folder)
         spark = (
             SparkSession.builder.master(f"local-cluster[{chosen.workers},1,1024]")
             # Workers here reach the driver whatever this machine's name stands for.
@@ -113,7 +126,7 @@ def main() -> int:
         spark.sparkContext.setLogLevel("ERROR")
         failed = 0
         # What a cluster does once is no part of it: workers that start, code that is compiled.
-        for number, traces in enumerate((8, *chosen.traces)):
+        for number, traces in enumerate((2 * chosen.workers, *chosen.traces)):
             step.append(f"{traces} traces")
             fleet = folder / f"fleet{number}"
             fleet.mkdir()

@@ -25,7 +25,7 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 
 class Processor(threading.Thread):
-    """Processor seconds of all processes below this one, also of those that have ended. What runs for less than the look is missed."""
+    """Processor seconds of all processes below this one, including those that have ended. Processes that run only between two samples are missed."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -38,12 +38,12 @@ class Processor(threading.Thread):
             self.look()
 
     def look(self) -> None:
-        """Takes down what each has used by now."""
+        """Records what each has used so far."""
         parents: dict[int, int] = {}
         used: dict[int, tuple[str, float]] = {}
         for folder in Path("/proc").glob("[0-9]*"):
             try:
-                # proc(5): behind the name in brackets come the state, the parent, and as 14th and 15th field the time.
+                # proc(5): after the name in brackets come the state, the parent, and as 14th and 15th field the time.
                 fields = (folder / "stat").read_text().rsplit(") ", 1)[1].split()
             except (OSError, IndexError):
                 continue
@@ -55,7 +55,7 @@ class Processor(threading.Thread):
             below |= more
         self._below = below
         for number in below & used.keys():
-            # With its start: numbers are used again.
+            # With its start time: process numbers are reused.
             start, seconds = used[number]
             self._used[number, start] = seconds
 
@@ -67,7 +67,7 @@ class Processor(threading.Thread):
                 os.kill(number, signal.SIGKILL)
 
     def seconds(self) -> float:
-        """All of it so far."""
+        """The total so far."""
         self.look()
         return sum(list(self._used.values()))
 

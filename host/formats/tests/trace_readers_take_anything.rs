@@ -37,7 +37,10 @@ fn files(test: &str, count: usize, compression: &str) -> Vec<(Format, Vec<u8>)> 
 }
 
 fn read_bytes(format: Format, bytes: &[u8]) -> (Vec<TraceRecord>, Vec<String>) {
-    assert_mixed_is_the_same(format, &ReadOptions::default(), bytes);
+    // The others have no way of their own for plain frames, and are many.
+    if !is_text(format) {
+        assert_mixed_is_the_same(format, &ReadOptions::default(), bytes);
+    }
     let source = Cursor::new(bytes.to_vec());
     match TraceReader::from_source("damaged", source, format, &ReadOptions::default()) {
         Ok(reader) => split(reader),

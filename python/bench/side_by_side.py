@@ -1,10 +1,12 @@
 """Compares the speed of this package with that of python-can, cantools and asammdf, in one run: `cargo xtask bench python`.
 
-Prints a table for docs/benchmarks.md. Times are the process's processor seconds, which say the same whatever else the machine does: the best of
-a few runs each, in turns, after one that nobody counts.
+Prints a table for docs/benchmarks.md. Times are the process's processor seconds, of all its threads, which say the same whatever else the machine
+does, and seconds of the wall's clock, which users wait: the best of a few runs each, in turns, after one that nobody counts. python-can, cantools
+and asammdf have one thread, cantap as many as it takes.
 """
 
 import argparse
+import os
 import pathlib
 import tempfile
 import time
@@ -19,15 +21,17 @@ CAR = pathlib.Path(__file__).parents[2] / "host/virtual/src/car/car.dbc"
 
 
 def beside(theirs, ours, runs):
-    """The shortest processor time in seconds and the result of each, run in turn."""
+    """The shortest processor time and the shortest time in seconds, and the result, of each, in turns."""
     times, results = ([], []), [None, None]
     for _ in range(runs + 1):
         for which, work in enumerate((theirs, ours)):
             results[which] = None
-            begin = time.process_time()
+            begin = time.process_time(), time.perf_counter()
             results[which] = work()
-            times[which].append(time.process_time() - begin)
-    return (min(times[0][1:]), results[0]), (min(times[1][1:]), results[1])
+            times[which].append((time.process_time() - begin[0], time.perf_counter() - begin[1]))
+    return [
+        (*(min(column) for column in zip(*of_one[1:])), result) for of_one, result in zip(times, results)
+    ]
 
 
 def make(folder, frames):
@@ -69,7 +73,23 @@ def decode_with_cantools(path):
 
 def decode_with_asammdf(path):
     with MDF(path) as file, file.extract_bus_logging({"CAN": [(str(CAR), 0)]}) as extracted:
-        return sum(len(group.channels) for group in extracted.groups)
+        return sum(len(group.channels) - 1 for group in extracted.groups)
+
+
+def values_with_asammdf(path):
+    """The same, and of each channel the physical values, as `cantap.decode` has them: before, they are the frames' raw numbers."""
+    with MDF(path) as file, file.extract_bus_logging({"CAN": [(str(CAR), 0)]}) as extracted:
+        return sum(
+            len(extracted.get(group=at, index=index).samples)
+            for at, group in enumerate(extracted.groups)
+            for index in range(1, len(group.channels))
+        )
+
+
+def sorted_by_asammdf(path):
+    """A file whose frames are in a group of their own, as most loggers write them."""
+    with MDF(path) as file:
+        return file.save(path.with_stem("sorted"), overwrite=True)
 
 
 def recv_loop(messages):
@@ -133,32 +153,51 @@ def main():
         folder = pathlib.Path(folder)
         make(folder, frames)
         blf, mf4 = folder / "drive.blf", folder / "drive.mf4"
-        database = cantap.load_database(CAR)
-        rows = []
+        of_group = sorted_by_asammdf(mf4)
 
-        def row(what, theirs, theirs_s, ours_s):
-            rows.append((what, theirs, theirs_s, ours_s))
-            print(f"| {what} | {theirs} | {theirs_s:.3f} | {ours_s:.4f} | {theirs_s / ours_s:.0f} × |", flush=True)
+        def row(what, theirs, by_theirs, by_ours, runs):
+            """Reads the database in each run, as the others do."""
+            (its_cpu, its_wall, counted), (cpu, wall, made) = beside(by_theirs, by_ours, runs)
+            print(
+                f"| {what} | {theirs} | {its_cpu:.3f} | {cpu:.4f} | {its_cpu / cpu:.1f} × "
+                f"| {its_wall:.3f} | {wall:.4f} | {its_wall / wall:.1f} × |",
+                flush=True,
+            )
+            return counted, made
 
-        print(f"{frames} frames\n\n| what | beside | its processor s | ours | |\n|---|---|---|---|---|")
-        (theirs, counted), (ours, table) = beside(
-            lambda: read_with_python_can(blf), lambda: cantap.read(blf), runs
+        print(f"{frames} frames, {os.cpu_count()} cores\n")
+        print("| what | beside | its processor s | cantap's | | its s | cantap's | |")
+        print("|---|---|---|---|---|---|---|---|")
+        counted, table = row(
+            "read BLF", "python-can", lambda: read_with_python_can(blf), lambda: cantap.read(blf), runs
         )
         if counted != len(table) or counted != frames:
             raise RuntimeError("not the same frames")
-        row("read BLF", "python-can", theirs, ours)
-        (theirs, values), (ours, decoded) = beside(
-            lambda: decode_with_cantools(blf), lambda: cantap.decode(blf, database), runs
+        both = "python-can + cantools"
+        values, decoded = row(
+            "BLF to a column per signal", both, lambda: decode_with_cantools(blf), lambda: cantap.decode(blf, CAR), runs
         )
         if decoded.report.values != values:
             raise RuntimeError(f"{decoded.report.values} values here, {values} there")
-        row("BLF to a column per signal", "python-can + cantools", theirs, ours)
-        (_, _), (ours, _) = beside(lambda: None, lambda: cantap.read(blf, db=database), runs)
-        row("BLF to a row per value", "python-can + cantools", theirs, ours)
-        (theirs, _), (ours, _) = beside(
-            lambda: decode_with_asammdf(mf4), lambda: cantap.decode(mf4, database), runs
-        )
-        row("MF4 to a column per signal", "asammdf extract_bus_logging", theirs, ours)
+        row("BLF to a row per value", both, lambda: decode_with_cantools(blf), lambda: cantap.read(blf, db=CAR), 1)
+        for file, words in ((mf4, "MF4"), (of_group, "MF4 as asammdf sorts it")):
+            its = "asammdf `extract_bus_logging`"
+            more = 3 * runs
+
+            def ours(file=file):
+                return cantap.decode(file, CAR)
+
+            channels, decoded = row(
+                f"{words} to a column per signal", its, lambda file=file: decode_with_asammdf(file), ours, more
+            )
+            columns = sum(len([name for name in table.column_names[3:] if not name.endswith(".text")]) for table in decoded.values())
+            if columns != channels:
+                raise RuntimeError(f"{columns} signals here, {channels} there")
+            its_values, decoded = row(
+                f"{words} to physical values", f"{its} and `get`", lambda file=file: values_with_asammdf(file), ours, more
+            )
+            if its_values != decoded.report.values or its_values != values:
+                raise RuntimeError(f"{decoded.report.values} values here, {its_values} there")
     print("\n| messages per second | |\n|---|---|")
     print(f"| `can.Bus.recv`, cantap | {most(recv_loop):,.0f} |")
     print(f"| `can.Bus.recv`, python-can's virtual interface | {most(virtual_loop):,.0f} |")

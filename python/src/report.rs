@@ -48,6 +48,12 @@ impl Counts {
         }
     }
 
+    /// Counts frames that are handed on.
+    pub fn count_frames(&mut self, frames: u64) {
+        self.records += frames;
+        self.frames += frames;
+    }
+
     /// Counts what could not be read.
     pub fn fault(&mut self, issue: &ReadIssue) {
         self.issues += 1;

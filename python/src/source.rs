@@ -6,8 +6,8 @@ use std::sync::Arc;
 use cantap_formats::time_range::{TimePoint, TimeRange};
 use cantap_formats::{Fault, Format, ReadOptions, TraceReader, Zone, open_reader};
 use cantap_signals::Decoder;
-use cantap_trace::TraceRecord;
 use cantap_trace::filter::Filter;
+use cantap_trace::{PlainFrame, TraceRecord};
 use pyo3::prelude::*;
 
 use crate::database::Database;
@@ -92,10 +92,35 @@ impl TraceSource {
 
     /// Replaces the content of `records` with the next ones, perhaps none; false at the end.
     pub fn next_batch(&mut self, records: &mut Vec<TraceRecord>) -> Result<bool, Error> {
+        self.next_of(None, records)
+    }
+
+    /// The same, where of data frames that come first nothing is wanted but what is decoded.
+    pub fn next_mixed(
+        &mut self,
+        frames: &mut Vec<PlainFrame>,
+        records: &mut Vec<TraceRecord>,
+    ) -> Result<bool, Error> {
+        frames.clear();
+        // What is chosen is chosen among records.
+        let is_all = self.is_all;
+        self.next_of(Some(frames).filter(|_| is_all), records)
+    }
+
+    fn next_of(
+        &mut self,
+        mut frames: Option<&mut Vec<PlainFrame>>,
+        records: &mut Vec<TraceRecord>,
+    ) -> Result<bool, Error> {
         loop {
-            match self.reader.next_batch(records) {
+            let read = match &mut frames {
+                Some(frames) => self.reader.next_mixed(frames, records),
+                None => self.reader.next_batch(records),
+            };
+            match read {
                 None => break,
                 Some(Ok(())) => {
+                    self.counts.count_frames(frames.as_ref().map_or(0, |frames| frames.len() as u64));
                     self.choose(records);
                     for record in records.iter() {
                         self.counts.count(record);

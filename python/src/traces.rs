@@ -10,13 +10,14 @@ use arrow_array::{ArrayRef, RecordBatch, RecordBatchReader, UInt64Array};
 use arrow_schema::{DataType, Field, Schema};
 use cantap_analysis::stats::{Options as StatOptions, Statistics};
 use cantap_columns::parquet::ParquetFile;
-use cantap_columns::{FrameColumns, MessageColumns};
+use cantap_columns::{FrameColumns, MessageTables};
 use cantap_formats::{LeftOut, TraceWriter, WriteOptions, create_writer};
 use cantap_signals::condition::Condition;
 use cantap_signals::search::{DataPattern, IdPattern, Search};
-use cantap_signals::{Decoder, Message, Selection, SignalValue};
+use cantap_signals::{Decoder, Message, Selection};
 use pyo3::prelude::*;
 
+use crate::ahead::Ahead;
 use crate::database::Database;
 use crate::error::Error;
 use crate::report::{Report, by_kind, from_json};
@@ -85,67 +86,12 @@ pub fn stats(
     from_json(py, &summary.to_string())
 }
 
-/// Turns records into a table for each message, and one for events other than frames.
-struct PerMessage {
-    decoder: Arc<Decoder>,
-    /// Only chosen signals: a message without any of them is not counted.
-    chosen: Option<Selection>,
-    /// By [`MessageRef::index`](cantap_signals::MessageRef::index).
-    tables: Vec<Option<Box<MessageColumns>>>,
-    events: FrameColumns,
-    values: Vec<SignalValue>,
-    /// Number of decoded frames.
-    decoded: u64,
-}
-
-/// The Python half makes a mapping of these: tables by name, and the events.
+/// What Python's half makes a mapping of: tables by name, and the events.
 type Tables = (Vec<(String, Table)>, Table);
 
-impl PerMessage {
-    fn new(decoder: Arc<Decoder>, signals: &[String]) -> Result<Self, Error> {
-        let chosen = if signals.is_empty() { None } else { Some(Selection::new(signals)?) };
-        let tables = decoder.messages().map(|_| None).collect();
-        Ok(Self { decoder, chosen, tables, events: FrameColumns::default(), values: Vec::new(), decoded: 0 })
-    }
-
-    /// Appends a record.
-    fn push(&mut self, record: &cantap::TraceRecord) {
-        let Self { decoder, chosen, tables, events, values, decoded } = self;
-        let Some(frame) = record.frame() else {
-            events.push(record);
-            return;
-        };
-        if frame.is_remote() {
-            return;
-        }
-        let Some(reference) = decoder.find(record.channel, frame.id()) else { return };
-        if chosen.is_some() && !decoder.is_selected(reference) {
-            return;
-        }
-        let table = &mut tables[reference.index()];
-        let table = table.get_or_insert_with(|| Box::new(MessageColumns::new(decoder, reference)));
-        if chosen.is_some() && !table.has_value(frame) {
-            // It depends on its bytes whether it has one of the signals.
-            values.clear();
-            decoder.decode_data(reference, frame.data(), values);
-            if values.is_empty() {
-                return;
-            }
-            table.push_values(record, values);
-        } else {
-            table.push(record);
-        }
-        *decoded += 1;
-    }
-
-    /// The number of decoded frames, and of values in them.
-    fn counts(&mut self) -> (u64, u64) {
-        (self.decoded, self.tables.iter_mut().flatten().map(|table| table.values()).sum())
-    }
-
-    fn finish(mut self) -> Tables {
-        (named(&self.decoder, self.tables, self.chosen.as_ref()), Table::of_batch(self.events.take()))
-    }
+/// What was chosen, if anything was.
+fn selection(signals: &[String]) -> Result<Option<Selection>, Error> {
+    Ok(if signals.is_empty() { None } else { Some(Selection::new(signals)?) })
 }
 
 /// A trace as a table for each message, and one for events other than frames.
@@ -153,14 +99,24 @@ impl PerMessage {
 pub fn decode(py: Python<'_>, options: Options) -> PyResult<(Tables, Py<Report>)> {
     let decoder =
         options.decoder()?.ok_or_else(|| Error::argument("a database decodes; give one with db="))?;
-    let mut tables = PerMessage::new(decoder, &options.signals)?;
+    let chosen = selection(&options.signals)?;
+    let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     let report = Report::default();
-    walk(py, &options, &report, |record| {
-        tables.push(record);
-        Ok(())
-    })?;
+    let for_source = report.clone();
+    let mut ahead = py.detach(|| Ahead::read(TraceSource::open(&options, for_source)?))?;
+    let mut next = || -> Result<bool, Error> {
+        let Some(batch) = ahead.next()? else { return Ok(false) };
+        tables.push_frames(&batch.frames);
+        batch.records.iter().for_each(|record| tables.push(record));
+        ahead.give_back(batch);
+        Ok(true)
+    };
+    while py.detach(&mut next)? {
+        py.check_signals()?;
+    }
+    warn(py, &report)?;
     report.set_decoded(py.detach(|| tables.counts()));
-    Ok((tables.finish(), Py::new(py, report)?))
+    Ok((finish(&decoder, tables, chosen.as_ref()), Py::new(py, report)?))
 }
 
 /// The same for a table of records.
@@ -171,7 +127,9 @@ pub fn decode_table(
     db: Py<Database>,
     signals: Vec<String>,
 ) -> PyResult<Tables> {
-    let mut tables = PerMessage::new(db.get().selecting(&signals)?, &signals)?;
+    let decoder = db.get().selecting(&signals)?;
+    let chosen = selection(&signals)?;
+    let mut tables = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
     for batch in batches_of(table)? {
         py.detach(|| -> Result<(), Error> {
             for record in records_of(batch)? {
@@ -181,20 +139,15 @@ pub fn decode_table(
         })?;
         py.check_signals()?;
     }
-    Ok(tables.finish())
+    Ok(finish(&decoder, tables, chosen.as_ref()))
 }
 
-/// The tables by their messages' names, in the database's order. If two have the same name, the identifier is appended to the
-/// later one.
-fn named(
-    decoder: &Decoder,
-    mut tables: Vec<Option<Box<MessageColumns>>>,
-    chosen: Option<&Selection>,
-) -> Vec<(String, Table)> {
+/// The tables by their messages' names, in the database's order. Of two with one name the later has its identifier behind it.
+fn finish(decoder: &Decoder, tables: MessageTables, chosen: Option<&Selection>) -> Tables {
+    let (tables, mut events) = tables.finish();
     let mut named: Vec<(String, Table)> = Vec::new();
-    for (reference, channel, message) in decoder.messages() {
-        let table = tables[reference.index()].take().filter(|table| table.rows() > 0);
-        let Some(mut table) = table else { continue };
+    for (reference, mut table) in tables {
+        let (channel, message) = (decoder.channel(reference), decoder.message(reference));
         let mut name = message.name.clone();
         if named.iter().any(|(other, _)| *other == name) {
             name = format!("{name}-{}", message.id);
@@ -206,7 +159,7 @@ fn named(
         let batch = chosen.map_or_else(|| batch.clone(), |chosen| only(&batch, message, chosen));
         named.push((name, Table::of_batch(batch)));
     }
-    named
+    (named, Table::of_batch(events.take()))
 }
 
 /// The columns for time, channel and identifier, and those of the chosen signals.

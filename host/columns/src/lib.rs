@@ -8,6 +8,7 @@ mod messages;
 pub mod parquet;
 mod records;
 mod signals;
+mod tables;
 mod texts;
 mod wide;
 
@@ -15,6 +16,7 @@ pub use frames::FrameColumns;
 pub use messages::MessageColumns;
 pub use records::{BadColumns, records};
 pub use signals::SignalColumns;
+pub use tables::MessageTables;
 pub use wide::WideColumns;
 
 /// The default limit of rows in a batch: a few megabytes, and what a Parquet reader takes at once.

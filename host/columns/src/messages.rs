@@ -8,15 +8,11 @@ use arrow_array::types::Int32Type;
 use arrow_array::{ArrayRef, RecordBatch, TimestampNanosecondArray, UInt8Array, UInt32Array};
 use arrow_schema::{DataType, Field, Schema, SchemaRef};
 use cantap_signals::{Decoder, Message, MessageRef, MessageRows, Signal, SignalRows, SignalValue};
-use cantap_trace::{TraceFrame, TraceRecord};
+use cantap_trace::{Id, PlainFrame, TraceRecord};
 use rustc_hash::FxHashMap;
 
 use crate::events;
 use crate::texts::Texts;
-
-/// How many frames are decoded at once: their columns stay in the processor's nearest cache, and the work done once per signal
-/// becomes negligible.
-const ROWS_AT_ONCE: usize = 512;
 
 /// One message's frames as columns: `time`, `channel`, `id`, then for each signal its physical value as float64 under its own name,
 /// null if the frame does not have it; for a signal with a value table also `NAME.text`. Unit, description, range and cycle time
@@ -28,7 +24,8 @@ pub struct MessageColumns {
     channel: Vec<u8>,
     id: Vec<u32>,
     signals: Vec<Column>,
-    /// The frames of the last rows, whose values are not yet in the columns.
+    /// The last rows' frames, of which there are no values in the columns yet: those are made together, when it is known how many
+    /// there are, for a column that grows is copied again and again.
     waiting: MessageRows,
     values: u64,
     scratch: Scratch,
@@ -122,10 +119,9 @@ impl MessageColumns {
         Arc::clone(&self.schema)
     }
 
-    /// Whether this frame certainly has a value for the table, whatever its bytes: chosen signals may be present in only some
-    /// frames.
-    pub fn has_value(&self, frame: &TraceFrame) -> bool {
-        self.waiting.is_certain(frame.data_len())
+    /// Whether a frame of so many bytes has a value for the table, whatever they are: chosen signals may be there in some frames only.
+    pub fn has_value(&self, data_len: usize) -> bool {
+        self.waiting.is_certain(data_len)
     }
 
     /// Appends a row for a data frame of the message, decoding it; nothing for another record.
@@ -140,17 +136,21 @@ impl MessageColumns {
             self.scratch.values = values;
             return;
         }
-        self.begin_row(record, frame);
-        if self.waiting.len() >= ROWS_AT_ONCE {
-            self.decode();
-        }
+        self.begin_row(record.time_ns, record.channel, frame.id());
+    }
+
+    /// Appends a row for a frame of the message, as [`Self::push`] does for its record.
+    #[inline]
+    pub fn push_frame(&mut self, frame: &PlainFrame) {
+        self.waiting.push_word(frame.data, frame.len);
+        self.begin_row(frame.time_ns, frame.channel, frame.id);
     }
 
     /// Appends a row for a frame of the message, with the values decoded from it; nothing for another record.
     pub fn push_values(&mut self, record: &TraceRecord, values: &[SignalValue]) {
         let Some(frame) = record.frame() else { return };
         self.decode();
-        self.begin_row(record, frame);
+        self.begin_row(record.time_ns, record.channel, frame.id());
         self.values += values.len() as u64;
         let message = self.waiting.message();
         for value in values {
@@ -165,24 +165,33 @@ impl MessageColumns {
         self.fill();
     }
 
-    fn begin_row(&mut self, record: &TraceRecord, frame: &TraceFrame) {
-        self.time_ns.push(record.time_ns);
-        self.channel.push(record.channel);
-        self.id.push(frame.id().raw());
+    #[inline]
+    fn begin_row(&mut self, time_ns: i64, channel: u8, id: Id) {
+        self.time_ns.push(time_ns);
+        self.channel.push(channel);
+        self.id.push(id.raw());
     }
 
-    /// Decodes the waiting frames.
-    fn decode(&mut self) {
+    /// How many values at most the frames have that wait for being decoded.
+    pub(crate) fn waiting_cells(&self) -> usize {
+        self.waiting.len() * self.signals.len()
+    }
+
+    /// Decodes the frames that wait for it.
+    pub(crate) fn decode(&mut self) {
         if self.waiting.is_empty() {
             return;
         }
         let Self { signals, waiting, values, scratch, .. } = self;
-        waiting.decode(|message, rows| {
-            let signal = &message.signals[rows.signal as usize];
-            let column = &mut signals[rows.signal as usize];
-            column.push(message, signal, &rows, scratch);
-            *values += rows.there.map_or(rows.raw.len(), |there| there.iter().filter(|there| **there).count())
-                as u64;
+        let rows = waiting.len();
+        waiting.decode(|message, found| {
+            let signal = &message.signals[found.signal as usize];
+            let column = &mut signals[found.signal as usize];
+            column.expect(rows);
+            column.push(message, signal, &found, scratch);
+            *values +=
+                found.there.map_or(found.raw.len(), |there| there.iter().filter(|there| **there).count())
+                    as u64;
         });
         self.fill();
     }
@@ -230,6 +239,16 @@ impl MessageColumns {
 }
 
 impl Column {
+    /// Makes room for so many rows in a column that has none yet.
+    fn expect(&mut self, rows: usize) {
+        if self.value.is_empty() {
+            self.value = Float64Builder::with_capacity(rows);
+            if let Some((texts, _)) = &mut self.text {
+                texts.expect(rows);
+            }
+        }
+    }
+
     /// Appends a signal's values in several frames.
     fn push(&mut self, message: &Message, signal: &Signal, rows: &SignalRows, scratch: &mut Scratch) {
         let is_there = |at: usize| rows.there.is_none_or(|there| there[at]);
@@ -245,6 +264,10 @@ impl Column {
         if let Some((texts, keys)) = &mut self.text {
             scratch.keys.clear();
             scratch.keys.extend(rows.raw.iter().map(|raw| keys.get(signal, *raw)));
+            if rows.there.is_none() && !scratch.keys.contains(&NO_TEXT) {
+                texts.push_slice(&scratch.keys);
+                return;
+            }
             scratch.is_text.clear();
             let is_text = |(at, key): (usize, &i32)| *key != NO_TEXT && is_there(at);
             scratch.is_text.extend(scratch.keys.iter().enumerate().map(is_text));

@@ -49,7 +49,17 @@ impl<K: ArrowDictionaryKeyType> Texts<K> {
         self.keys.append_nulls(times);
     }
 
-    /// Appends the texts with these indexes; null where `is_text` is false.
+    /// Makes room for so many rows in an empty column.
+    pub fn expect(&mut self, rows: usize) {
+        self.keys = PrimitiveBuilder::with_capacity(rows);
+    }
+
+    /// Appends the texts of these indexes.
+    pub fn push_slice(&mut self, keys: &[K::Native]) {
+        self.keys.append_slice(keys);
+    }
+
+    /// Appends the texts of these indexes; none where `is_text` is false.
     pub fn push_all(&mut self, keys: &[K::Native], is_text: &[bool]) {
         self.keys.append_values(keys, is_text);
     }

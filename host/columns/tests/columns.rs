@@ -1,13 +1,16 @@
 //! Columns hold everything in a record, and decoded values as the decoder returns them.
 
+use std::sync::Arc;
+
+use arrow_array::RecordBatch;
 use arrow_array::cast::AsArray;
 use arrow_array::types::{Float64Type, Int32Type, UInt64Type};
-use cantap_columns::{FrameColumns, MessageColumns, SignalColumns, records};
+use cantap_columns::{FrameColumns, MessageColumns, MessageTables, SignalColumns, records};
 use cantap_signals::{
     ByteOrder, Database, Decoder, Message, Multiplexed, Signal, Source, ValueKind, ValueTable, dbc,
 };
 use cantap_trace::testing::record_or_fd;
-use cantap_trace::{Direction, FdFrame, Frame, Id, TraceEvent, TraceFrame, TraceRecord};
+use cantap_trace::{Direction, FdFrame, Frame, Id, PlainFrame, TraceEvent, TraceFrame, TraceRecord};
 use proptest::prelude::*;
 
 proptest! {
@@ -173,7 +176,7 @@ proptest! {
             let event = TraceEvent::Frame { frame, direction: Direction::Rx, late: false };
             let record = TraceRecord { time_ns: at as i64, channel: 1, event };
             prop_assert_eq!(decoder.decode(1, &frame, &mut values), Some(reference));
-            prop_assert!(!together.has_value(&frame) || !values.is_empty());
+            prop_assert!(!together.has_value(frame.data_len()) || !values.is_empty());
             together.push(&record);
             alone.push_values(&record, &values);
             count += values.len() as u64;
@@ -181,5 +184,67 @@ proptest! {
         prop_assert_eq!((together.values(), alone.values()), (count, count));
         prop_assert_eq!(together.take(), alone.take());
         prop_assert_eq!(together.rows(), 0);
+    }
+
+    /// A table for each message has what the decoder gives for each record alone, and what happened beside frames is in a table of its own:
+    /// whether its frames come as records or as plain ones.
+    #[test]
+    fn tables_of_messages_have_what_each_record_says(
+        messages in prop::collection::vec((prop::collection::vec(signal(), 1..4), any::<bool>(), 0u32..3), 1..4),
+        chosen in prop::option::of(prop::collection::vec(any::<bool>(), 12)),
+        records in prop::collection::vec((record_or_fd(1), 0usize..4, any::<bool>()), 0..60),
+    ) {
+        let messages = messages.into_iter().enumerate().map(|(at, (mut signals, extended, id))| {
+            let id = if extended { Id::extended(id) } else { Id::standard(id) }.unwrap();
+            signals.iter_mut().enumerate().for_each(|(at, signal)| signal.name = format!("S{at}"));
+            let (name, description, j1939) = (format!("M{at}"), String::new(), extended);
+            Message { id, name, description, length: 8, cycle_ms: None, j1939, signals, line: 0 }
+        });
+        let database = Database { messages: messages.collect(), ..Database::default() };
+        let mut decoder = Decoder::new(vec![Source { channel: None, database }]);
+        if let Some(chosen) = &chosen {
+            decoder.retain(|message, index, _| chosen[4 * message.index() + index % 4]);
+        }
+        let decoder = Arc::new(decoder);
+        // Most have an identifier of a message.
+        let records: Vec<_> = records.into_iter().map(|(mut record, id, extended)| {
+            let id = if extended { Id::extended(id as u32) } else { Id::standard(id as u32) }.unwrap();
+            if let TraceEvent::Frame { frame: TraceFrame::Classic(frame), .. } = &mut record.event {
+                *frame = Frame::from_bus(id, frame.is_remote(), frame.dlc(), frame.padded_data());
+            }
+            record
+        }).collect();
+        let mut expected = decoder.messages().map(|(reference, ..)| MessageColumns::new(&decoder, reference)).collect::<Vec<_>>();
+        let (mut events, mut values, mut frames, mut count) = (FrameColumns::default(), Vec::new(), 0, 0);
+        let mut of_records = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
+        let mut of_frames = MessageTables::new(Arc::clone(&decoder), chosen.is_some());
+        for record in &records {
+            of_records.push(record);
+            match PlainFrame::of(record) {
+                Some(frame) => of_frames.push_frames(&[frame]),
+                None => of_frames.push(record),
+            }
+            let Some(frame) = record.frame() else {
+                events.push(record);
+                continue;
+            };
+            if let Some(reference) = decoder.decode(record.channel, frame, &mut values)
+                && (chosen.is_none() || !values.is_empty())
+            {
+                expected[reference.index()].push_values(record, &values);
+                frames += 1;
+                count += values.len() as u64;
+            }
+        }
+        let events = events.take();
+        let expected: Vec<RecordBatch> =
+            expected.iter_mut().filter(|table| table.rows() > 0).map(MessageColumns::take).collect();
+        for mut tables in [of_records, of_frames] {
+            prop_assert_eq!(tables.counts(), (frames, count));
+            let (tables, mut beside) = tables.finish();
+            let tables: Vec<_> = tables.into_iter().map(|(_, mut table)| table.take()).collect();
+            prop_assert_eq!(&tables, &expected);
+            prop_assert_eq!(beside.take(), events.clone());
+        }
     }
 }

@@ -7,12 +7,15 @@ use super::found::Found;
 use super::input::Input;
 use super::left_out::LeftOut;
 use super::output::Patch;
-use cantap_trace::TraceRecord;
+use cantap_trace::{PlainFrame, TraceRecord};
 
 /// Records decoded at a time: few enough to stay in the processor's cache.
 pub(crate) const BATCH: usize = 256;
 
-/// Name of the rows and objects that Vector's programs write before they send a frame.
+/// Plain frames decoded at a time: more, because they may go to another thread.
+pub(crate) const PLAIN_BATCH: usize = 4096;
+
+/// Of the rows and objects that Vector's programs write before they send a frame.
 pub(crate) const REQUESTS_TO_SEND: &str =
     "requests to send were skipped: what was sent is in the trace as sent";
 
@@ -38,6 +41,18 @@ pub(crate) trait Decode: Send {
                 return Ok(None);
             }
         }
+    }
+
+    /// As [`Self::batch`], but data frames at its beginning may be in `frames` instead. Formats have their own where a frame can be
+    /// taken out of the file without becoming a record in between.
+    fn mixed(
+        &mut self,
+        input: &mut Input,
+        frames: &mut Vec<PlainFrame>,
+        records: &mut Vec<TraceRecord>,
+    ) -> io::Result<Option<Found>> {
+        let _ = frames;
+        self.batch(input, records)
     }
 }
 

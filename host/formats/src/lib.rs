@@ -6,6 +6,10 @@
 
 #![forbid(unsafe_code)]
 
+// What unit tests share with the others calls it by its name.
+#[cfg(test)]
+extern crate self as cantap_formats;
+
 mod analyser;
 mod asc;
 mod blf;

@@ -9,6 +9,7 @@ mod blocks;
 mod decode;
 mod encode;
 mod layout;
+mod plain;
 mod record;
 mod stream;
 #[cfg(test)]

@@ -17,7 +17,7 @@ use super::{
     Format, UnknownFormat, asc, blf, busmaster, candump, candump_screen, canhacker, canking, crtd, csv, dif,
     kvaser, mf4, microchip, pcap, pcapng, printer, trc,
 };
-use cantap_trace::TraceRecord;
+use cantap_trace::{PlainFrame, TraceRecord};
 
 /// How to read.
 #[derive(Clone, Debug, Default)]
@@ -305,13 +305,48 @@ impl TraceReader {
                 Beyond::End => return None,
             }
         }
+        self.hand_out(records);
+        Some(Ok(()))
+    }
+
+    /// As [`Self::next_batch`], but data frames of classical CAN may be in `frames`, and are then before all `records`: for
+    /// whoever wants nothing of them but what [`PlainFrame`] has. Which frames are there depends on the format and on how
+    /// the file is laid out; the order does not.
+    pub fn next_mixed(
+        &mut self,
+        frames: &mut Vec<PlainFrame>,
+        records: &mut Vec<TraceRecord>,
+    ) -> Option<Result<(), ReadIssue>> {
+        frames.clear();
+        records.clear();
+        while self.at == self.batch.len() {
+            if self.ended || self.after.is_some() {
+                match self.beyond_batch() {
+                    Beyond::Batch => continue,
+                    Beyond::Issue(issue) => return Some(Err(issue)),
+                    Beyond::End => return None,
+                }
+            }
+            self.batch.clear();
+            self.at = 0;
+            self.after = self.decoder.mixed(&mut self.input, frames, &mut self.batch).transpose();
+            self.records += (frames.len() + self.batch.len()) as u64;
+            if !frames.is_empty() {
+                break;
+            }
+        }
+        self.hand_out(records);
+        Some(Ok(()))
+    }
+
+    /// Puts what is left of the batch into `records`, which is empty.
+    fn hand_out(&mut self, records: &mut Vec<TraceRecord>) {
         if self.at == 0 {
             std::mem::swap(records, &mut self.batch);
         } else {
             records.extend(self.batch.drain(..).skip(self.at));
         }
         self.at = 0;
-        Some(Ok(()))
     }
 }
 

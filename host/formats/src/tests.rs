@@ -1,5 +1,8 @@
 //! What the tests of all formats have in common: files in memory.
 
+#[path = "../tests/traces/mixed.rs"]
+mod mixed;
+
 use std::io;
 use std::sync::{Arc, Mutex};
 
@@ -49,6 +52,7 @@ pub(crate) fn read(format: Format, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>
 
 /// The same with other options.
 pub(crate) fn read_with(options: &ReadOptions, bytes: impl AsRef<[u8]>) -> (Vec<TraceRecord>, Vec<String>) {
+    mixed::assert_mixed_is_the_same(options.format.unwrap(), options, bytes.as_ref());
     let source = io::Cursor::new(bytes.as_ref().to_vec());
     let reader = TraceReader::from_source("test", source, options.format.unwrap(), options).unwrap();
     let mut records = Vec::new();

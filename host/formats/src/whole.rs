@@ -31,10 +31,20 @@ impl Whole {
 
     /// The bytes at a position, at most as many as requested.
     pub(crate) fn read_at(&mut self, at: u64, len: usize) -> io::Result<Vec<u8>> {
-        let there = self.len.saturating_sub(at).min(len as u64);
-        let mut bytes = vec![0; there as usize];
-        self.source.seek(SeekFrom::Start(at))?;
-        self.source.read_exact(&mut bytes)?;
+        let mut bytes = Vec::new();
+        self.append_at(at, len, &mut bytes)?;
         Ok(bytes)
+    }
+
+    /// The same, appended.
+    pub(crate) fn append_at(&mut self, at: u64, len: usize, bytes: &mut Vec<u8>) -> io::Result<()> {
+        let there = self.len.saturating_sub(at).min(len as u64);
+        bytes.reserve(there as usize);
+        self.source.seek(SeekFrom::Start(at))?;
+        let read = self.source.by_ref().take(there).read_to_end(bytes)?;
+        if (read as u64) < there {
+            return Err(io::ErrorKind::UnexpectedEof.into());
+        }
+        Ok(())
     }
 }

@@ -10,6 +10,7 @@ use std::path::Path;
 use cantap_formats::{CsvDialect, Format, ReadOptions, TraceReader, open_reader};
 use cantap_trace::TraceRecord;
 use proptest::prelude::*;
+use traces::mixed::assert_mixed_is_the_same;
 use traces::{directory, file_name, odd, read, real, split, write};
 
 /// Traffic of every kind, small enough to be cut at every byte.
@@ -36,6 +37,10 @@ fn files(test: &str, count: usize, compression: &str) -> Vec<(Format, Vec<u8>)> 
 }
 
 fn read_bytes(format: Format, bytes: &[u8]) -> (Vec<TraceRecord>, Vec<String>) {
+    // The others have no way of their own for plain frames, and are many.
+    if !is_text(format) {
+        assert_mixed_is_the_same(format, &ReadOptions::default(), bytes);
+    }
     let source = Cursor::new(bytes.to_vec());
     match TraceReader::from_source("damaged", source, format, &ReadOptions::default()) {
         Ok(reader) => split(reader),
@@ -137,6 +142,21 @@ fn no_flipped_byte_makes_a_reader_panic_or_invent_records() {
             }
             bytes[at] = original;
         }
+    }
+}
+
+/// Where it is worth it, frames do not become records first.
+#[test]
+fn nearly_all_frames_of_blf_and_mf4_are_plain_ones() {
+    for (format, bytes) in files("plain", 2000, "") {
+        let source = Cursor::new(bytes);
+        let mut reader = TraceReader::from_source("plain", source, format, &ReadOptions::default()).unwrap();
+        let (mut frames, mut records, mut plain) = (Vec::new(), Vec::new(), 0);
+        while reader.next_mixed(&mut frames, &mut records).is_some() {
+            plain += frames.len() as u64;
+        }
+        let is_fast = matches!(format, Format::Blf | Format::Mf4);
+        assert_eq!(is_fast, plain * 10 > reader.records() * 9, "{format}: {plain} of {}", reader.records());
     }
 }
 

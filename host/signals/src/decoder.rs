@@ -106,12 +106,16 @@ impl Lookup {
         self.extended.insert(raw, place)
     }
 
+    #[inline]
     fn find(&self, id: Id) -> Option<u32> {
-        let raw = id.raw();
-        if !id.is_extended() {
-            let place = *self.standard.get(raw as usize)?;
-            return (place != NONE).then_some(place);
+        if id.is_extended() {
+            return self.find_extended(id.raw());
         }
+        let place = *self.standard.get(id.raw() as usize)?;
+        (place != NONE).then_some(place)
+    }
+
+    fn find_extended(&self, raw: u32) -> Option<u32> {
         if let Some(&place) = self.extended.get(&raw) {
             return Some(place);
         }
@@ -228,7 +232,8 @@ impl Decoder {
         })
     }
 
-    /// The message for an identifier on a channel.
+    /// The message that an identifier means on a channel.
+    #[inline]
     pub fn find(&self, channel: u8, id: Id) -> Option<MessageRef> {
         self.by_channel.get(&channel).unwrap_or(&self.common).find(id).map(MessageRef)
     }

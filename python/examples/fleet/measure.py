@@ -1,14 +1,17 @@
 """Measures the job on this machine: `python measure.py TRACE DATABASE --traces 20 40 80 --workers 2`.
 
-Fleets of these sizes are made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here. Prints seconds of
-the decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be compared.
+Fleets of these sizes are made of copies of one trace, ten for each vehicle, and decoded by a Spark cluster of worker processes here, of one core each.
+Prints seconds of the decoding, and the processor seconds of everything that took part: on a machine that others use as well only those can be
+compared. What is not done within `--limit` seconds is given up, with exit code 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import shutil
+import signal
 import sys
 import tempfile
 import threading
@@ -27,6 +30,7 @@ class Processor(threading.Thread):
     def __init__(self) -> None:
         super().__init__(daemon=True)
         self._used: dict[tuple[int, str], float] = {}
+        self._below: set[int] = set()
         self._over = threading.Event()
 
     def run(self) -> None:
@@ -49,10 +53,18 @@ class Processor(threading.Thread):
         below = {os.getpid()}
         while more := {number for number, parent in parents.items() if parent in below} - below:
             below |= more
+        self._below = below
         for number in below & used.keys():
             # With its start time: process numbers are reused.
             start, seconds = used[number]
             self._used[number, start] = seconds
+
+    def kill(self) -> None:
+        """Ends the processes below this one at once."""
+        self.look()
+        for number in self._below - {os.getpid()}:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(number, signal.SIGKILL)
 
     def seconds(self) -> float:
         """The total so far."""
@@ -71,6 +83,21 @@ def make(folder: Path, trace: Path, database: Path, traces: int) -> None:
         shutil.copy(trace, vehicle / f"drive{number % 10}{suffixes}")
 
 
+def give_up_after(seconds: float, step: list[str], processor: Processor, folder: Path) -> None:
+    """Ends the program when its time is over, whatever Spark waits for."""
+
+    def end() -> None:
+        print(f"given up after {seconds:g} s, at: {step[-1]}", file=sys.stderr, flush=True)
+        # Without a word: Spark would say at length what it thinks of it.
+        processor.kill()
+        shutil.rmtree(folder, ignore_errors=True)
+        os._exit(1)
+
+    timer = threading.Timer(seconds, end)
+    timer.daemon = True
+    timer.start()
+
+
 def main() -> int:
     """Measures once."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -78,22 +105,29 @@ def main() -> int:
     parser.add_argument("database", type=Path)
     parser.add_argument("--traces", type=int, nargs="+", default=[20, 40, 80])
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--limit", type=float, default=180.0, help="seconds for all of it [default: 180]")
     chosen = parser.parse_args()
     os.environ["PYSPARK_PYTHON"] = sys.executable
+    step = ["starting Spark"]
     with tempfile.TemporaryDirectory(prefix="cantap-fleet-") as name:
         folder = Path(name)
         processor = Processor()
         processor.start()
+        give_up_after(chosen.limit, step, processor, folder)
         spark = (
             SparkSession.builder.master(f"local-cluster[{chosen.workers},1,1024]")
+            # Workers here reach the driver whatever this machine's name stands for.
+            .config("spark.driver.host", "localhost")
+            .config("spark.sql.shuffle.partitions", str(2 * chosen.workers))
             .config("spark.ui.enabled", "false")
             .config("spark.ui.showConsoleProgress", "false")
             .getOrCreate()
         )
         spark.sparkContext.setLogLevel("ERROR")
         failed = 0
-        # This excludes what a cluster does only once: starting workers, compiling code.
-        for number, traces in enumerate((8, *chosen.traces)):
+        # What a cluster does once is no part of it: workers that start, code that is compiled.
+        for number, traces in enumerate((2 * chosen.workers, *chosen.traces)):
+            step.append(f"{traces} traces")
             fleet = folder / f"fleet{number}"
             fleet.mkdir()
             make(fleet, chosen.trace, chosen.database, traces)

@@ -5,7 +5,7 @@ use std::io;
 use flate2::{Decompress, FlushDecompress, Status};
 
 use super::super::calendar::Date;
-use super::super::codec::{BATCH, Decode, REQUESTS_TO_SEND};
+use super::super::codec::{BATCH, Decode, PLAIN_BATCH, REQUESTS_TO_SEND};
 use super::super::found::Found;
 use super::super::input::{Input, MAX_ITEM_BYTES};
 use super::super::issue::{Fault, Place};
@@ -16,7 +16,7 @@ use super::{
     DIRECTION, EVENT_COMMENT, EXTENDED, FILE_BYTES_OFFSET, FILE_HEADER_BYTES, FILE_MAGIC, HEADER_BYTES,
     LOG_CONTAINER, OBJECT_MAGIC, REMOTE, REQUESTED, SENT, START_OFFSET, TIME_IN_TEN_US,
 };
-use cantap_trace::{Direction, Frame, Id, TraceEvent, TraceRecord};
+use cantap_trace::{Direction, Frame, Id, PlainFrame, TraceEvent, TraceRecord};
 
 /// Reads BLF.
 pub(crate) struct Decoder {
@@ -72,7 +72,21 @@ fn system_time(bytes: &[u8]) -> Option<i64> {
 
 const EXPECTED_OBJECT: &str = "an object that begins with LOBJ";
 
-/// The result of looking for an object.
+/// The length of a classical frame's object: its header, and 16 bytes of fields.
+const CLASSICAL_BYTES: usize = HEADER_BYTES + 16;
+
+/// A classical frame about which there is nothing else to say.
+struct Classical {
+    time_ns: i64,
+    channel: u8,
+    id: Id,
+    direction: Direction,
+    remote: bool,
+    dlc: u8,
+    data: [u8; 8],
+}
+
+/// What came out of looking for an object.
 enum Object {
     Event(TraceRecord),
     Request,
@@ -109,6 +123,26 @@ impl Decode for Decoder {
             if records.len() >= BATCH || input.may_wait() {
                 return Ok(None);
             }
+        }
+    }
+
+    fn mixed(
+        &mut self,
+        input: &mut Input,
+        frames: &mut Vec<PlainFrame>,
+        records: &mut Vec<TraceRecord>,
+    ) -> io::Result<Option<Found>> {
+        self.plain_frames(frames);
+        if !frames.is_empty() {
+            return Ok(None);
+        }
+        // One alone, because plain frames may follow it.
+        match self.next(input)? {
+            Found::Record(record) => {
+                records.push(record);
+                Ok(None)
+            }
+            other => Ok(Some(other)),
         }
     }
 
@@ -268,39 +302,59 @@ impl Decoder {
     /// Appends classical frames, which are most of a trace, up to the first object that is anything else or needs a report, which is
     /// left to [`Self::object`]. It skips that function's individual checks and does not copy a record more than once.
     fn frames(&mut self, records: &mut Vec<TraceRecord>) {
-        const FIELDS_BYTES: usize = 16;
-        const LEN: usize = HEADER_BYTES + FIELDS_BYTES;
-        /// Signature, a header of 32 bytes in its first version, and length, as in each of these objects.
-        const HEAD: [u8; 12] = [b'L', b'O', b'B', b'J', HEADER_BYTES as u8, 0, 1, 0, LEN as u8, 0, 0, 0];
-        if self.loss_told {
-            return;
-        }
         let room = BATCH.saturating_sub(records.len());
-        for object in self.objects[self.at..].chunks_exact(LEN).take(room) {
-            let Some(object) = object.first_chunk::<LEN>() else { return };
-            let field =
-                |at: usize| u32::from_le_bytes([object[at], object[at + 1], object[at + 2], object[at + 3]]);
-            if object[..HEAD.len()] != HEAD || !matches!(field(12), CAN_MESSAGE | CAN_MESSAGE2) {
-                return;
-            }
-            let (flags, dlc, raw, channel) = (object[34], object[35], field(36), object[32]);
-            let direction = match flags & DIRECTION {
-                SENT => Direction::Tx,
-                REQUESTED => return,
-                _ => Direction::Rx,
-            };
-            let id = raw & !EXTENDED;
-            let id = if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) };
-            let (Some(id), 0..=15, 0) = (id, dlc, object[33]) else { return };
-            let data = std::array::from_fn(|at| object[40 + at]);
-            let frame = Frame::from_bus(id, flags & REMOTE != 0, dlc, data).into();
-            records.push(TraceRecord {
-                time_ns: self.time_ns(field(16), u64::from(field(24)) | u64::from(field(28)) << 32),
-                channel,
-                event: TraceEvent::Frame { frame, direction, late: false },
-            });
-            self.at += LEN;
+        let frames = self.classical().take(room).map(|frame| {
+            let Classical { time_ns, channel, id, direction, remote, dlc, data } = frame;
+            let frame = Frame::from_bus(id, remote, dlc, data).into();
+            TraceRecord { time_ns, channel, event: TraceEvent::Frame { frame, direction, late: false } }
+        });
+        let before = records.len();
+        records.extend(frames);
+        self.at += (records.len() - before) * CLASSICAL_BYTES;
+    }
+
+    /// The same for data frames alone.
+    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) {
+        frames.reserve(PLAIN_BATCH);
+        let plain = self.classical().take_while(|frame| !frame.remote).take(PLAIN_BATCH);
+        let plain =
+            plain.map(|frame| PlainFrame::new(frame.time_ns, frame.channel, frame.id, frame.dlc, frame.data));
+        let before = frames.len();
+        frames.extend(plain);
+        self.at += (frames.len() - before) * CLASSICAL_BYTES;
+    }
+
+    /// The classical frames that come next, without using them up.
+    #[inline]
+    fn classical(&self) -> impl Iterator<Item = Classical> {
+        // A loss behind the comment that says the same is not to be told twice.
+        let objects = if self.loss_told { &[] } else { &self.objects[self.at..] };
+        objects.chunks_exact(CLASSICAL_BYTES).map_while(|object| self.classical_frame(object.first_chunk()?))
+    }
+
+    /// The frame of an object; `None` if there is anything to say about it.
+    #[inline]
+    fn classical_frame(&self, object: &[u8; CLASSICAL_BYTES]) -> Option<Classical> {
+        /// Signature, header of 32 bytes in its first version, and length, as they stand in each of these objects.
+        const HEAD: [u8; 12] =
+            [b'L', b'O', b'B', b'J', HEADER_BYTES as u8, 0, 1, 0, CLASSICAL_BYTES as u8, 0, 0, 0];
+        let field =
+            |at: usize| u32::from_le_bytes([object[at], object[at + 1], object[at + 2], object[at + 3]]);
+        if object[..HEAD.len()] != HEAD || !matches!(field(12), CAN_MESSAGE | CAN_MESSAGE2) {
+            return None;
         }
+        let (flags, dlc, raw, channel) = (object[34], object[35], field(36), object[32]);
+        let direction = match flags & DIRECTION {
+            SENT => Direction::Tx,
+            REQUESTED => return None,
+            _ => Direction::Rx,
+        };
+        let id = raw & !EXTENDED;
+        let id = if raw & EXTENDED != 0 { Id::extended(id) } else { Id::standard(id) };
+        let (Some(id), 0..=15, 0) = (id, dlc, object[33]) else { return None };
+        let time_ns = self.time_ns(field(16), u64::from(field(24)) | u64::from(field(28)) << 32);
+        let data = std::array::from_fn(|at| object[40 + at]);
+        Some(Classical { time_ns, channel, id, direction, remote: flags & REMOTE != 0, dlc, data })
     }
 
     /// An object's time, in the unit given by its flags.

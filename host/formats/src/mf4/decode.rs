@@ -4,7 +4,7 @@ use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap, HashMap, VecDeque};
 use std::io;
 
-use super::super::codec::Decode;
+use super::super::codec::{Decode, PLAIN_BATCH};
 use super::super::found::Found;
 use super::super::input::Input;
 use super::super::issue::{Fault, Place};
@@ -12,9 +12,10 @@ use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u16_at, u32_at, u64_at};
 use super::layout::{Bytes, Content, Events, Group};
+use super::plain::Plain;
 use super::stream::Stream;
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
-use cantap_trace::TraceRecord;
+use cantap_trace::{PlainFrame, TraceRecord};
 
 const MEASURED: &str = "groups of measured signals";
 
@@ -65,6 +66,8 @@ struct Part {
     /// Bytes before each record that identify its group.
     id_bytes: usize,
     groups: Vec<Group>,
+    /// For those whose records are plain frames at fixed places.
+    plain: Vec<Option<Plain>>,
     by_id: HashMap<u64, usize>,
     /// Groups whose records are the bytes of another group's records, by address.
     values: HashMap<u64, Values>,
@@ -97,6 +100,28 @@ struct Values {
 impl Decode for Decoder {
     fn needs_one_line(&self) -> bool {
         false
+    }
+
+    fn mixed(
+        &mut self,
+        input: &mut Input,
+        frames: &mut Vec<PlainFrame>,
+        records: &mut Vec<TraceRecord>,
+    ) -> io::Result<Option<Found>> {
+        if let Some(open) = self.open.as_mut().filter(|_| self.first.is_empty()) {
+            open.plain_frames(frames)?;
+        }
+        if !frames.is_empty() {
+            return Ok(None);
+        }
+        // One alone, because plain frames may follow it.
+        match self.next(input)? {
+            Found::Record(record) => {
+                records.push(record);
+                Ok(None)
+            }
+            other => Ok(Some(other)),
+        }
     }
 
     fn next(&mut self, input: &mut Input) -> io::Result<Found> {
@@ -145,6 +170,24 @@ impl Opened {
             Some(Item::Fault(at, fault)) => Found::Issue(Place::Offset(at), fault),
             None => Found::End,
         })
+    }
+
+    /// Appends plain frames, up to whatever else comes next.
+    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>) -> io::Result<()> {
+        frames.reserve(PLAIN_BATCH);
+        while frames.len() < PLAIN_BATCH
+            && let Some(Reverse((_, index))) = self.next.peek().copied()
+            && let Some(Item::Record(record)) = &self.parts[index].next
+            && let Some(frame) = PlainFrame::of(record)
+        {
+            self.next.pop();
+            frames.push(frame);
+            let others = self.next.peek().map(|Reverse(first)| *first);
+            let is_next = |time_ns| others.is_none_or(|first| (time_ns, index) < first);
+            self.parts[index].plain_frames(frames, is_next);
+            self.advance(index)?;
+        }
+        Ok(())
     }
 
     fn advance(&mut self, index: usize) -> io::Result<()> {
@@ -250,6 +293,11 @@ impl Part {
             return Err(Fault::malformed("records that say of which group they are", found.as_bytes()));
         }
         let by_id = groups.iter().enumerate().map(|(at, group)| (group.record_id, at)).collect();
+        let plain = groups.iter().map(|group| match &group.content {
+            Content::Bus(bus) => Plain::of(bus, group.record_bytes, start_ns),
+            Content::Values | Content::Signals => None,
+        });
+        let plain = plain.collect();
         let values = groups.iter().filter(|group| matches!(group.content, Content::Values));
         let values = values.map(|group| (group.address, Values::default())).collect();
         let stream = Stream::open(file, block.link(2), open_end)?;
@@ -261,6 +309,7 @@ impl Part {
             id_bytes,
             counts: vec![0; groups.len()],
             groups,
+            plain,
             by_id,
             values,
             by_order: open & OPEN_PLACES != 0,
@@ -352,7 +401,43 @@ impl Part {
         }
     }
 
-    /// What is wrong if no record follows.
+    /// Appends the plain frames that follow and are at hand, as long as it is their turn; what comes then is for [`Self::advance`].
+    fn plain_frames(&mut self, frames: &mut Vec<PlainFrame>, is_next: impl Fn(i64) -> bool) {
+        if self.ended || !self.waiting.is_empty() {
+            return;
+        }
+        // Records of one group follow each other: it is looked up once.
+        let mut last: Option<(u64, usize)> = None;
+        while frames.len() < PLAIN_BATCH {
+            let mut bytes = self.stream.held(self.at);
+            let mut group = 0;
+            if self.id_bytes > 0 {
+                let Some((id, rest)) = bytes.split_at_checked(self.id_bytes) else { return };
+                let id = id.iter().rev().fold(0, |id: u64, byte| id << 8 | u64::from(*byte));
+                group = match last {
+                    Some((known, group)) if known == id => group,
+                    _ => match self.by_id.get(&id) {
+                        Some(group) => *group,
+                        None => return,
+                    },
+                };
+                last = Some((id, group));
+                bytes = rest;
+            }
+            let Some(plain) = &self.plain[group] else { return };
+            let is_over = self.counts[0] >= self.records;
+            let Some(frame) = plain.frame(bytes, self.counts[group]).filter(|_| !is_over) else { return };
+            if !is_next(frame.time_ns) {
+                return;
+            }
+            self.at += (self.id_bytes + self.groups[group].record_bytes) as u64;
+            self.counts[group] += 1;
+            self.time_ns = frame.time_ns;
+            frames.push(frame);
+        }
+    }
+
+    /// What is wrong where no record follows.
     fn fault_of_end(&self) -> Option<Fault> {
         let rest = self.stream.len().saturating_sub(self.at);
         let is_sorted = self.records != u64::MAX;

@@ -63,6 +63,7 @@ impl Field {
         self.bits_of(record, big_endian)
     }
 
+    #[inline]
     fn bits_of(&self, record: &[u8], big_endian: bool) -> Option<u64> {
         if self.bits == 0 || self.bits > 64 {
             return None;
@@ -82,7 +83,26 @@ impl Field {
         Some((all >> self.bit) as u64 & mask)
     }
 
-    /// Whether a flag is set, or has the text that means it is set.
+    /// Where its number stands in each record of this length; `None` where [`Self::unsigned`] has more to do than to look there.
+    pub(super) fn place(&self, record_bytes: usize) -> Option<Place> {
+        let Kind::Integer { big_endian: false, .. } = self.kind else { return None };
+        let end = u32::from(self.bit) + self.bits;
+        let is_inside = self.at.checked_add(end.div_ceil(8) as usize)? <= record_bytes;
+        let is_word = self.bits > 0 && end <= 64;
+        (is_inside && is_word).then(|| Place {
+            at: self.at,
+            bit: self.bit,
+            mask: u64::MAX >> (64 - self.bits),
+        })
+    }
+
+    /// Where its bytes begin, and how many there are; `None` if not all are inside a record of this length.
+    pub(super) fn span(&self, record_bytes: usize) -> Option<(usize, usize)> {
+        let len = self.bits as usize / 8;
+        (self.at.checked_add(len)? <= record_bytes).then_some((self.at, len))
+    }
+
+    /// Whether a flag is set, or a text says what the flag stands for.
     pub(super) fn flag(&self, record: &[u8], text: &[u8]) -> bool {
         match self.kind {
             Kind::Text => self.bytes(record).is_some_and(|bytes| bytes.starts_with(text)),
@@ -93,6 +113,7 @@ impl Field {
     }
 
     /// A signed integer, exactly.
+    #[inline]
     fn signed(&self, record: &[u8]) -> Option<i64> {
         let Kind::Integer { big_endian, signed } = self.kind else { return None };
         let bits = self.bits_of(record, big_endian)?;
@@ -111,7 +132,27 @@ impl Field {
     }
 }
 
-/// How a group gives the time of its records.
+/// Where a number stands, in a word of eight bytes.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    at: usize,
+    bit: u8,
+    mask: u64,
+}
+
+impl Place {
+    /// So many bytes must be there behind the place.
+    pub(super) const BYTES: usize = 8;
+
+    /// The number; 0 if there are fewer bytes.
+    #[inline]
+    pub(super) fn get(&self, bytes: &[u8]) -> u64 {
+        let word = bytes.get(self.at..).and_then(<[u8]>::first_chunk);
+        word.map_or(0, |word| u64::from_le_bytes(*word) >> self.bit & self.mask)
+    }
+}
+
+/// How a group tells the time of its records.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Clock {
     /// If `None`, the number of the record.
@@ -130,6 +171,13 @@ impl Clock {
         let is_whole = step_ns >= 1.0 && (factor_s * NS_PER_S - step_ns).abs() < 1e-9 * step_ns;
         let step_ns = (is_whole && offset_s == 0.0).then_some(step_ns as i64);
         Self { field, offset_s, factor_s, step_ns }
+    }
+
+    /// Where a counter is that needs nothing but to be multiplied, and by what; [`Self::ns`] is for the others, and for what is too large.
+    pub(super) fn counter(&self, record_bytes: usize) -> Option<(Place, i64)> {
+        let field = self.field.as_ref()?;
+        let is_signed = matches!(field.kind, Kind::Integer { signed: true, .. });
+        Some((field.place(record_bytes).filter(|_| !is_signed || field.bits == 64)?, self.step_ns?))
     }
 
     /// Nanoseconds since the start of the measurement.

@@ -6,8 +6,8 @@ use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
 
-/// Plain data is read in pieces of this many bytes.
-const PIECE_BYTES: u64 = 1 << 20;
+/// Plain data is read in pieces of this many bytes: they stay in the processor's cache until they have been gone through.
+const PIECE_BYTES: u64 = 1 << 18;
 
 /// The standard allows at most 4 MiB in a compressed block; other programs write more. Anything larger means
 /// damage.
@@ -156,7 +156,14 @@ impl Stream {
         Ok(self.buffer.get(from..from + len))
     }
 
-    /// Loads these bytes into the buffer.
+    /// The bytes from a place on that are at hand, perhaps none.
+    #[inline]
+    pub(super) fn held(&self, at: u64) -> &[u8] {
+        let from = at.checked_sub(self.buffer_start).and_then(|from| usize::try_from(from).ok());
+        from.and_then(|from| self.buffer.get(from..)).unwrap_or_default()
+    }
+
+    /// Makes the buffer hold these bytes.
     fn load(&mut self, file: &mut Whole, at: u64, end: u64) -> Result<(), Fault> {
         let held_until = self.buffer_start + self.buffer.len() as u64;
         if at >= self.buffer_start && at <= held_until {
@@ -175,14 +182,13 @@ impl Stream {
             }
             let holds = self.pieces.partition_point(|piece| piece.start + piece.len <= loaded);
             let Some(piece) = self.pieces.get(holds).copied() else { return Ok(()) };
-            let bytes = if let Some(packed) = piece.packed {
-                unpack(file, piece, packed)?
+            if let Some(packed) = piece.packed {
+                self.buffer.extend_from_slice(&unpack(file, piece, packed)?);
             } else {
                 let within = loaded - piece.start;
                 let len = (piece.len - within).min(PIECE_BYTES);
-                file.read_at(piece.at + within, len as usize)?
-            };
-            self.buffer.extend_from_slice(&bytes);
+                file.append_at(piece.at + within, len as usize, &mut self.buffer)?;
+            }
         }
     }
 }

@@ -3,6 +3,8 @@
 
 #![allow(dead_code, reason = "each test file uses some of them")]
 
+pub mod mixed;
+
 use std::path::{Path, PathBuf};
 
 use cantap_formats::{Format, LeftOut, ReadOptions, WriteOptions, create_writer, open_reader};

@@ -4,7 +4,11 @@ use super::{Conversion, MessagePlan, Payload, SignalPlan, SignalValue};
 use crate::layout::ByteOrder;
 use crate::model::Message;
 
-/// Frames of one message that are decoded together, made by [`super::super::Decoder::rows`].
+/// So many frames are decoded at once: their columns stay in the processor's nearest memory, and what is done once for each signal
+/// counts for nothing.
+const ROWS_AT_ONCE: usize = 512;
+
+/// Frames of one message that are decoded together. [`super::super::Decoder::rows`] makes it.
 #[derive(Clone, Debug)]
 pub struct MessageRows {
     message: Message,
@@ -12,7 +16,6 @@ pub struct MessageRows {
     /// Each frame's data bytes, the first one lowest, with zeros beyond its length.
     words: Vec<u64>,
     lens: Vec<u8>,
-    shortest: u8,
     raw: Vec<u64>,
     value: Vec<f64>,
     there: Vec<bool>,
@@ -34,7 +37,7 @@ pub struct SignalRows<'a> {
 impl MessageRows {
     pub(crate) fn new(message: Message, plan: MessagePlan) -> Self {
         let (words, lens, raw, value, there) = (vec![], vec![], vec![], vec![], vec![]);
-        Self { message, plan, words, lens, shortest: u8::MAX, raw, value, there }
+        Self { message, plan, words, lens, raw, value, there }
     }
 
     /// The message.
@@ -58,11 +61,15 @@ impl MessageRows {
         let mut padded = [0; 8];
         let Some(bytes) = padded.get_mut(..data.len()) else { return false };
         bytes.copy_from_slice(data);
-        let len = data.len() as u8;
-        self.words.push(u64::from_le_bytes(padded));
-        self.lens.push(len);
-        self.shortest = self.shortest.min(len);
+        self.push_word(u64::from_le_bytes(padded), data.len() as u8);
         true
+    }
+
+    /// Adds a frame's data: the first byte lowest, zeros beyond the length of at most eight.
+    #[inline]
+    pub fn push_word(&mut self, word: u64, len: u8) {
+        self.words.push(word);
+        self.lens.push(len);
     }
 
     /// Decodes a single frame's data of any length, appending to `values`.
@@ -76,37 +83,36 @@ impl MessageRows {
         self.plan.groups.iter().any(|group| group.conditions.is_empty() && group.signals.iter().any(fits))
     }
 
-    /// Decodes the waiting frames and forgets them. `each` gets each of the chosen signals once; if some frames do not have it,
-    /// [`SignalRows::there`] says which do.
+    /// Decodes the frames that wait and forgets them. `each` gets the signals that were chosen, some frames at a time, in their
+    /// order; where a frame has none of a signal, [`SignalRows::there`] says so.
     pub fn decode(&mut self, mut each: impl FnMut(&Message, SignalRows<'_>)) {
-        if self.is_empty() {
-            return;
-        }
-        let Self { message, plan, words, lens, shortest, raw, value, there } = self;
-        for group in &plan.groups {
-            for signal in &group.signals {
-                raw.clear();
-                value.clear();
-                let is_always_there =
-                    group.conditions.is_empty() && signal.field.needed <= *shortest && !signal.indicates;
-                if is_always_there && signal.column(words, raw, value) {
-                    each(message, SignalRows { signal: signal.index, raw, value, there: None });
-                    continue;
+        let Self { message, plan, words, lens, raw, value, there } = self;
+        for (words, lens) in words.chunks(ROWS_AT_ONCE).zip(lens.chunks(ROWS_AT_ONCE)) {
+            let shortest = lens.iter().copied().min().unwrap_or(0);
+            for group in &plan.groups {
+                for signal in &group.signals {
+                    raw.clear();
+                    value.clear();
+                    let is_always_there =
+                        group.conditions.is_empty() && signal.field.needed <= shortest && !signal.indicates;
+                    if is_always_there && signal.column(words, raw, value) {
+                        each(message, SignalRows { signal: signal.index, raw, value, there: None });
+                        continue;
+                    }
+                    there.clear();
+                    for (word, len) in words.iter().zip(lens) {
+                        let payload = Payload::Frame { little: *word, big: word.swap_bytes(), len: *len };
+                        let found = if group.holds(payload) { signal.decode(message, payload) } else { None };
+                        raw.push(found.map_or(0, |found| found.raw));
+                        value.push(found.map_or(f64::NAN, |found| found.value));
+                        there.push(found.is_some());
+                    }
+                    each(message, SignalRows { signal: signal.index, raw, value, there: Some(there) });
                 }
-                there.clear();
-                for (word, len) in words.iter().zip(lens.iter()) {
-                    let payload = Payload::Frame { little: *word, big: word.swap_bytes(), len: *len };
-                    let found = if group.holds(payload) { signal.decode(message, payload) } else { None };
-                    raw.push(found.map_or(0, |found| found.raw));
-                    value.push(found.map_or(f64::NAN, |found| found.value));
-                    there.push(found.is_some());
-                }
-                each(message, SignalRows { signal: signal.index, raw, value, there: Some(there) });
             }
         }
         words.clear();
         lens.clear();
-        *shortest = u8::MAX;
     }
 }
 

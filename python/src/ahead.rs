@@ -1,0 +1,85 @@
+//! A trace that is read by a thread of its own, a few batches ahead of whoever goes through them.
+
+use std::panic;
+use std::sync::mpsc::{Receiver, Sender, SyncSender, channel, sync_channel};
+use std::thread::{self, JoinHandle};
+
+use cantap_trace::{PlainFrame, TraceRecord};
+
+use crate::error::Error;
+use crate::source::TraceSource;
+
+/// More would be memory for nothing: reading takes longer than what is done with the batches, or the other way round.
+const BATCHES: usize = 8;
+
+/// What is read at a time: frames first, then records.
+#[derive(Default)]
+pub struct Batch {
+    pub frames: Vec<PlainFrame>,
+    pub records: Vec<TraceRecord>,
+}
+
+/// The thread and its batches.
+pub struct Ahead {
+    batches: Option<Receiver<Batch>>,
+    /// Batches that were gone through, whose memory is used again.
+    used: Sender<Batch>,
+    thread: Option<JoinHandle<Result<(), Error>>>,
+}
+
+impl Ahead {
+    /// Begins to read.
+    pub fn read(source: TraceSource) -> Result<Self, Error> {
+        let (filled, batches) = sync_channel(BATCHES);
+        let (used, again) = channel();
+        let thread = thread::Builder::new().name("cantap reader".to_owned());
+        let thread = thread.spawn(move || fill(source, &filled, &again));
+        let thread = thread.map_err(|error| Error::Io(error, "a thread that reads".to_owned()))?;
+        Ok(Self { batches: Some(batches), used, thread: Some(thread) })
+    }
+
+    /// The next batch; `None` at the end. Its memory goes back by [`Self::give_back`].
+    pub fn next(&mut self) -> Result<Option<Batch>, Error> {
+        if let Some(batch) = self.batches.as_ref().and_then(|batches| batches.recv().ok()) {
+            return Ok(Some(batch));
+        }
+        self.end()?;
+        Ok(None)
+    }
+
+    /// Hands a batch back that is not needed any more.
+    pub fn give_back(&self, batch: Batch) {
+        // At the file's end nobody wants it.
+        let _ = self.used.send(batch);
+    }
+
+    /// Waits for the thread, which ends when nobody takes its batches.
+    fn end(&mut self) -> Result<(), Error> {
+        self.batches = None;
+        match self.thread.take().map(JoinHandle::join) {
+            None => Ok(()),
+            Some(Ok(result)) => result,
+            Some(Err(panicked)) => panic::resume_unwind(panicked),
+        }
+    }
+}
+
+impl Drop for Ahead {
+    fn drop(&mut self) {
+        self.batches = None;
+        if let Some(thread) = self.thread.take() {
+            // Given up on: what it could not read is of no interest.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn fill(mut source: TraceSource, filled: &SyncSender<Batch>, again: &Receiver<Batch>) -> Result<(), Error> {
+    loop {
+        let mut batch = again.try_recv().unwrap_or_default();
+        let more = source.next_mixed(&mut batch.frames, &mut batch.records)?;
+        if filled.send(batch).is_err() || !more {
+            return Ok(());
+        }
+    }
+}

@@ -8,7 +8,8 @@ use super::model::{Message, Signal};
 
 /// Patterns of signals; without any, all signals are chosen.
 ///
-/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name.
+/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name. For a signal in a contained PDU
+/// that is `Pdu.Signal` or `Message.Pdu.Signal`.
 /// `*` is any text, `?` one character, `[a-z]` one of several. Upper and lower case differ.
 #[derive(Clone, Debug, Default)]
 pub struct Selection {
@@ -53,9 +54,11 @@ impl Selection {
         self.patterns.is_empty() || self.patterns.iter().any(|pattern| matches(pattern, message, signal))
     }
 
-    /// Whether a message's name is chosen.
+    /// Whether a message's name is chosen, or that of a PDU that it may contain.
     pub fn names(&self, message: &Message) -> bool {
-        self.patterns.iter().any(|pattern| pattern.matches(&message.name))
+        let pdus = message.container.iter().flat_map(|container| &container.pdus);
+        let mut names = std::iter::once(&message.name).chain(pdus.map(|pdu| &pdu.name));
+        names.any(|name| self.patterns.iter().any(|pattern| pattern.matches(name)))
     }
 
     /// Fails if one of the patterns chooses nothing of these messages: most likely a slip of the pen.
@@ -80,7 +83,11 @@ impl Selection {
 
 fn matches(pattern: &Pattern, message: &Message, signal: &Signal) -> bool {
     if pattern.as_str().contains('.') {
-        pattern.matches(&format!("{}.{}", message.name, signal.name))
+        let is_named = |of: &str| pattern.matches(&format!("{of}.{}", signal.name));
+        match &signal.contained {
+            None => is_named(&message.name),
+            Some(pdu) => is_named(&pdu.name) || is_named(&format!("{}.{}", message.name, pdu.name)),
+        }
     } else {
         pattern.matches(&signal.name)
     }

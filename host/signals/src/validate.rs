@@ -67,8 +67,15 @@ fn tidy(database: &mut Database) {
     for message in &mut database.messages {
         clean::make(&mut message.name, clean::line);
         clean::make(&mut message.description, clean::lines);
+        for pdu in message.container.iter_mut().flat_map(|container| &mut container.pdus) {
+            clean::make(&mut pdu.name, clean::line);
+            clean::make(&mut pdu.description, clean::lines);
+        }
         for signal in &mut message.signals {
             clean::make(&mut signal.name, clean::line);
+            if let Some(pdu) = &mut signal.contained {
+                clean::make(&mut pdu.name, clean::line);
+            }
             clean::make(&mut signal.unit, clean::line);
             clean::make(&mut signal.description, clean::lines);
             signal.values.clean();
@@ -79,9 +86,10 @@ fn tidy(database: &mut Database) {
 
 /// Numbers signals of the same name that one frame may carry together.
 fn number_twins(message: &mut Message) {
-    let mut by_name: HashMap<&str, Vec<usize>> = HashMap::new();
+    let mut by_name: HashMap<_, Vec<usize>> = HashMap::new();
     for (place, signal) in message.signals.iter().enumerate() {
-        by_name.entry(&signal.name).or_default().push(place);
+        let pdu = signal.contained.as_ref().map(|pdu| pdu.place);
+        by_name.entry((pdu, &signal.name)).or_default().push(place);
     }
     let mut numbers = Vec::new();
     for places in by_name.into_values().filter(|places| places.len() > 1) {
@@ -125,7 +133,8 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
     };
     let mut names = HashSet::new();
     for signal in &message.signals {
-        if !names.insert(signal.name.as_str()) {
+        let pdu = signal.contained.as_ref().map(|pdu| pdu.place);
+        if !names.insert((pdu, signal.name.as_str())) {
             report(signal, FaultKind::DuplicateSignal);
         }
         let length_fits = match signal.kind {
@@ -146,7 +155,8 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
         } else if factor == 0.0 {
             report(signal, FaultKind::ZeroFactor);
         }
-        let (needed, length) = (signal.bytes_needed(), message.length);
+        let length = message.room_of(signal);
+        let needed = signal.bytes_needed();
         if needed > length.into() {
             report(signal, FaultKind::OutsideMessage { needed, length });
         }

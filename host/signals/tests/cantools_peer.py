@@ -40,6 +40,37 @@ def decode(message, node, data, texts):
     return decoded
 
 
+def contained(message, random_bytes):
+    """A container's bytes, made by hand so that headers of no known PDU, PDUs that come twice or are cut, and padding are among them."""
+    data = b""
+    for _ in range(random_bytes.randrange(5)):
+        inner = random_bytes.choice(message.contained_messages)
+        header_id, length = inner.header_id, inner.length
+        if random_bytes.random() < 0.2:
+            header_id, length = random_bytes.randrange(1, 1 << 24), random_bytes.randrange(9)
+        elif random_bytes.random() < 0.2:
+            length = random_bytes.randrange(inner.length + 1)
+        data += header_id.to_bytes(3, "big") + bytes([length]) + random_bytes.randbytes(length)
+    if random_bytes.random() < 0.2:
+        data = data[: random_bytes.randrange(len(data) + 1)]
+    return data[: message.length]
+
+
+def decode_container(message, data, texts):
+    """The signals of each PDU under `PDU.signal`, of one that comes again those of the last."""
+    values = {}
+    for inner, bytes_of_it in message.unpack_container(data, allow_truncated=True):
+        if isinstance(inner, int):
+            continue
+        of_it = {}
+        decoded = decode(inner, inner._codecs, bytes_of_it, of_it)
+        for known, new in ((values, decoded), (texts, of_it)):
+            for name in [name for name in known if name.startswith(f"{inner.name}.")]:
+                del known[name]
+            known.update({f"{inner.name}.{name}": value for name, value in new.items()})
+    return values
+
+
 def decode_file(path):
     import cantools
 
@@ -56,11 +87,16 @@ def decode_file(path):
             if number % TRUNCATED_EVERY == 0 and length:
                 length = random_bytes.randrange(length)
             data = random_bytes.randbytes(length)
+            if message.is_container:
+                data = contained(message, random_bytes)
             answer = {"message": message.name, "id": message.frame_id, "extended": message.is_extended_frame}
             answer["data"] = data.hex()
             try:
                 texts = {}
-                values = decode(message, message._codecs, data, texts)
+                if message.is_container:
+                    values = decode_container(message, data, texts)
+                else:
+                    values = decode(message, message._codecs, data, texts)
                 answer["texts"] = texts
                 answer["signals"] = {name: text(value) for name, value in values.items()}
             except Exception as error:

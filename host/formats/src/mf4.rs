@@ -3,7 +3,7 @@
 //!
 //! A file is blocks with links between them, so it is read at any place and not as a stream. Groups sorted and not, data in
 //! one block or in lists, compressed by deflate, zstd or LZ4, with rows and columns exchanged or not, bytes in the records or
-//! apart, files that were not finished: all is read. Data kept in columns (4.2), whose times are in another group, is not. Measured signals are counted.
+//! apart, times in another group (the columns of 4.2), files that were not finished: all is read. Measured signals are counted.
 
 mod blocks;
 mod decode;

@@ -1,13 +1,15 @@
 """What cantools decodes, as JSON lines, for tests/signals_agree_with_cantools.rs.
 
-    cantools_peer.py decode FILE...    100 random payloads per message of each database
+    cantools_peer.py decode FILE...    $PAYLOADS random payloads, or 100, per message of each database
     cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
+    cantools_peer.py others DIR        as files, the databases of canmatrix and opendbc
 
 Values are printed as text: integers of any size, floats with every digit.
 """
 
 import contextlib
 import json
+import os
 import pathlib
 import random
 import subprocess
@@ -15,7 +17,7 @@ import sys
 import tarfile
 from importlib.metadata import version
 
-PAYLOADS = 100
+PAYLOADS = int(os.environ.get("PAYLOADS", "100"))
 TRUNCATED_EVERY = 10
 
 
@@ -104,22 +106,39 @@ def decode_file(path):
             print(json.dumps(answer))
 
 
-def fetch(directory):
-    directory = pathlib.Path(directory)
-    release = f"cantools-{version('cantools')}"
+# Nothing is installed of these: only their files are wanted.
+OTHERS = {"canmatrix": "1.2", "opendbc": "0.3.1"}
+
+
+def source(directory, name, number):
+    """The folder of a release's source."""
+    release = f"{name}-{number}"
     if not (directory / release).is_dir():
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
-        subprocess.run([*command, f"cantools=={version('cantools')}", "--dest", directory], check=True)
+        subprocess.run([*command, f"{name}=={number}", "--dest", directory], check=True)
         with contextlib.closing(tarfile.open(directory / f"{release}.tar.gz")) as archive:
             archive.extractall(directory, filter="data")
+    return directory / release
+
+
+def fetch_others(directory):
+    for name, number in OTHERS.items():
+        for path in sorted(source(pathlib.Path(directory), name, number).rglob("*")):
+            if path.suffix.lower() in (".dbc", ".kcd", ".sym", ".arxml"):
+                print(path)
+
+
+def fetch(directory):
+    files = source(pathlib.Path(directory), "cantools", version("cantools")) / "tests" / "files"
     for kind in ("dbc", "kcd", "sym", "arxml"):
-        files = (directory / release / "tests" / "files" / kind).iterdir()
-        print("\n".join(sorted(str(path) for path in files if path.suffix.lower() == f".{kind}")))
+        print("\n".join(sorted(str(path) for path in (files / kind).iterdir() if path.suffix.lower() == f".{kind}")))
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "files":
         fetch(sys.argv[2])
+    elif sys.argv[1] == "others":
+        fetch_others(sys.argv[2])
     else:
         for name in sys.argv[2:]:
             decode_file(name)

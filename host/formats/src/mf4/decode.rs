@@ -206,7 +206,7 @@ fn collect(
     let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
     let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
     let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
-    let alone = alone(file, header.link(0))?;
+    let alone = alone(file, header.link(0));
     let (mut next, mut count) = (header.link(0), 0);
     if next == 0 {
         return Err(Fault::malformed("a group of data", b"none"));
@@ -231,7 +231,7 @@ fn collect(
 }
 
 /// Groups of records that are alone in their group of data.
-fn alone(file: &mut Whole, first: u64) -> Result<Alone, Fault> {
+fn alone(file: &mut Whole, first: u64) -> Alone {
     let (mut alone, mut next, mut count) = (Alone::new(), first, 0);
     while next != 0 && count * BLOCK_HEAD_BYTES <= file.len() {
         // What is wrong with it is said when it is read.
@@ -242,7 +242,7 @@ fn alone(file: &mut Whole, first: u64) -> Result<Alone, Fault> {
         next = group.link(0);
         count += 1;
     }
-    Ok(alone)
+    alone
 }
 
 impl Part {

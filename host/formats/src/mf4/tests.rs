@@ -177,7 +177,7 @@ fn the_lists_of_4_2_are_read_and_the_bits_that_lie_apart_say_what_is_valid() {
             blocks.push(*b"##LD", &[end, first, second], &fields(2))
         };
         let file = finish(blocks, group, list, 0, 0);
-        let valid = |at: usize| !apart || at % 10 != 0 || (50..75).contains(&at);
+        let valid = |at: usize| !apart || !at.is_multiple_of(10) || (50..75).contains(&at);
         let expected: Vec<_> = log()
             .lines()
             .enumerate()

@@ -117,18 +117,15 @@ fn changes(was: &TraceRecord, is: &TraceRecord) -> Option<u64> {
 fn missing(written: &[TraceRecord], back: &[TraceRecord]) -> (u64, String) {
     let (mut count, mut text, mut rest) = (0, String::new(), back);
     for record in written {
-        match rest.first().and_then(|next| Some((next, changes(record, next)?))) {
-            Some((next, changes)) => {
-                count += changes;
-                if changes > 0 {
-                    let _ = writeln!(text, "  {changes}: {record:?}\n     {next:?}");
-                }
-                rest = &rest[1..];
+        if let Some((next, changes)) = rest.first().and_then(|next| Some((next, changes(record, next)?))) {
+            count += changes;
+            if changes > 0 {
+                let _ = writeln!(text, "  {changes}: {record:?}\n     {next:?}");
             }
-            None => {
-                count += 1;
-                let _ = writeln!(text, "  -: {record:?}");
-            }
+            rest = &rest[1..];
+        } else {
+            count += 1;
+            let _ = writeln!(text, "  -: {record:?}");
         }
     }
     if let Some(next) = rest.first() {

@@ -12,6 +12,8 @@ pub const MAX_BYTES: u16 = 1785;
 /// Makes a database of the messages. Those with a fault that makes values wrong are left out with a warning; where no message
 /// is left, and something was wrong, it is an error.
 pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Result<Database, DatabaseError> {
+    // What was not understood may have been all of its messages.
+    let is_without_messages = messages.is_empty();
     let mut usable = Vec::with_capacity(messages.len());
     for mut message in messages {
         let before = faults.len();
@@ -22,7 +24,11 @@ pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Res
     }
     check_ids(&usable, &mut faults);
     faults.sort_by_key(|fault| fault.line);
-    let is_serious = |fault: &Fault| !fault.kind.is_warning() || matches!(fault.kind, FaultKind::LeftOut(_));
+    let is_serious = |fault: &Fault| {
+        !fault.kind.is_warning()
+            || matches!(fault.kind, FaultKind::LeftOut(_))
+            || is_without_messages && matches!(fault.kind, FaultKind::Ignored(_))
+    };
     if usable.is_empty() && faults.iter().any(is_serious) {
         faults.retain(is_serious);
         for fault in &mut faults {

@@ -1,9 +1,9 @@
-//! ASAM MDF 4, the format of loggers and measurement programs, as far as it holds the traffic of a bus: the names
-//! `CAN_DataFrame`, `CAN_RemoteFrame` and `CAN_ErrorFrame` with their parts, which ASAM's *Bus Logging* gives such records.
+//! ASAM MDF 4, the format of loggers and measurement programs, as far as it holds bus traffic: the names `CAN_DataFrame`,
+//! `CAN_RemoteFrame` and `CAN_ErrorFrame` with their parts, which ASAM's *Bus Logging* gives such records.
 //!
-//! A file is blocks with links between them, so it is read at any place and not as a stream. Groups sorted and not, data in
-//! one block or in lists, compressed by deflate, zstd or LZ4, with rows and columns exchanged or not, bytes in the records or
-//! apart, times in another group (the columns of 4.2), files that were not finished: all is read. Measured signals are counted.
+//! A file consists of linked blocks, so it needs random access and cannot be read as a stream. Supported are sorted and unsorted groups; data in one
+//! block or in lists, compressed by deflate, zstd or LZ4, transposed or not; bytes inside or outside the records; times in another group (the columns
+//! of 4.2); and unfinished files. Measured signals are counted.
 
 mod blocks;
 mod decode;
@@ -25,13 +25,13 @@ use cantap_wire::record::BusErrorKind;
 pub(crate) const FILE_MAGIC: &[u8] = b"MDF     ";
 pub(crate) const UNFINISHED_MAGIC: &[u8] = b"UnFinMF ";
 
-/// The channel of what the standard has no event for, in the words of [`super::event_text`].
+/// The channel for events that the standard does not have, in the words of [`super::event_text`].
 const WORDS: &str = "cantap_Event";
 
 /// Where the first block is.
 const HEADER_AT: u64 = 64;
 
-/// The kinds of errors by the standard's numbers. It has one, 1, for bit errors of either direction.
+/// The kinds of errors by the standard's numbers. It has a single one, 1, for bit errors in either direction.
 const ERROR_TYPES: [(u64, BusErrorKind); 4] = [
     (2, BusErrorKind::Form),
     (3, BusErrorKind::Stuff),

@@ -1,4 +1,4 @@
-//! What a record of a group says.
+//! The content of a group's record.
 
 use super::super::event_text::EventText;
 use super::super::frame_fields::{FdFields, FrameFields, Payload, fd_len, identifier};
@@ -8,7 +8,7 @@ use super::layout::{BusGroup, Bytes, Events, Field};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 impl BusGroup {
-    /// Whether its records have all that there is to know of them themselves.
+    /// Whether its records alone say everything about their frames.
     pub(super) fn is_complete(&self) -> bool {
         matches!(self.bytes, None | Some(Bytes::Here(_)))
             && !matches!(self.events, Events::Other(_))
@@ -17,13 +17,13 @@ impl BusGroup {
             && !self.all_invalid
     }
 
-    /// Whether one of the bits behind a record's values says that it is no event.
+    /// Whether one of the bits after a record's values marks it as invalid.
     pub(super) fn is_invalid(&self, bits: &[u8]) -> bool {
         let is_set = |bit: &u32| bits.get(*bit as usize / 8).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
         self.all_invalid || self.invalid_bits.iter().any(is_set)
     }
 
-    /// What a record says. `time`: the record with its time, which may be itself. `apart`: its frame's bytes, where they are not in it.
+    /// The content of a record. `time`: the record with its time, which may be itself. `apart`: its frame's bytes, if they are stored elsewhere.
     pub(super) fn record(
         &self,
         record: &[u8],
@@ -104,7 +104,7 @@ impl BusGroup {
             Fault::malformed(format!("up to {longest} data bytes"), found.as_bytes())
         };
         let data = data.ok_or_else(fault)?;
-        // A classical frame's code can say more than its eight bytes.
+        // A classical frame's length code can be above 8.
         let code = code.filter(|code| !is_fd && len == 8 && (9..=15).contains(code));
         fields(code.unwrap_or(len) as u8).event(&data)
     }

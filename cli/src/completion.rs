@@ -221,7 +221,8 @@ fn offer_values(current: &OsStr) -> Vec<CompletionCandidate> {
     match last.split_once('=') {
         None => {
             let taken = |label: &str| before.split(',').any(|part| part.split('=').next() == Some(label));
-            let signals = message.signals.iter().filter(|signal| !taken(&signal.label()));
+            let signals =
+                message.signals.iter().filter(|signal| signal.contained.is_none() && !taken(&signal.label()));
             let signals = signals.map(|signal| (format!("{head}{}=", signal.label()), signal.unit.clone()));
             beginning(current, signals)
         }

@@ -84,6 +84,19 @@ fn windows_are_listed_and_add_up() {
 }
 
 #[test]
+fn a_trace_that_is_shorter_than_a_window_says_why_it_has_none() {
+    let log = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("short-for-windows.log");
+    std::fs::write(&log, "(1.000000) can0 123#11\n(1.010000) can0 124#22\n(1.020000) can0 125#33\n").unwrap();
+    let text = stdout(cantap().arg("stats").arg(&log).args(["-b", "500k"]));
+    assert!(
+        text.contains("windows   1 s: the trace is too short for one; choose shorter ones with --window"),
+        "{text}"
+    );
+    let text = stdout(cantap().arg("stats").arg(&log).args(["-b", "500k", "--window", "5ms"]));
+    assert!(text.contains("windows   0.005 s: least 0.000 %"), "{text}");
+}
+
+#[test]
 fn what_cannot_be_measured_is_refused_with_the_reason() {
     let reason = failure(cantap().arg("stats").arg(boat()).args(["-b", "10k", "--window", "1ms"]));
     assert_eq!(

@@ -110,3 +110,49 @@ fn coverage_says_what_is_missing_on_either_side() {
     let json: serde_json::Value = serde_json::from_str(&out).unwrap();
     assert_eq!(json["databases"][0]["messages"][0]["signals"][1]["factor"], 0.1);
 }
+
+/// Frames of containers, which say themselves what is in them.
+#[test]
+fn what_containers_contain_is_described_decoded_and_counted() {
+    let directory = PathBuf::from(env!("CARGO_TARGET_TMPDIR")).join("db-container");
+    std::fs::create_dir_all(&directory).unwrap();
+    let file = directory.join("container.arxml");
+    std::fs::write(&file, include_str!("../../host/signals/tests/data/container.arxml")).unwrap();
+    let trace = directory.join("trace.log");
+    let lines =
+        "(1.000000) can0 123##107010203030801F4\n(1.020000) can0 123##1070A0B0C02FFFF010203030901F50000\n";
+    std::fs::write(&trace, lines).unwrap();
+    let cantap = |arguments: &[&str]| {
+        let mut command = Command::new(env!("CARGO_BIN_EXE_cantap"));
+        let Output { status, stdout, stderr } =
+            command.args(arguments).current_dir(&directory).output().unwrap();
+        assert_eq!(status.code(), Some(0), "{}", String::from_utf8_lossy(&stderr));
+        (String::from_utf8(stdout).unwrap(), String::from_utf8(stderr).unwrap())
+    };
+    let (shown, _) = cantap(&["db", "container.arxml", "--message", "Engine"]);
+    assert!(
+        shown.contains("from byte 1 on a container of PDUs, each behind a short header:\n    010203 Engine, 3 bytes, every 20 ms")
+            && shown.contains("  in Brake:\n")
+            && shown.contains("  Engine.Speed: bit 15, 16 bits, big-endian"),
+        "{shown}"
+    );
+    let (decoded, err) = cantap(&["decode", "trace.log", "--db", "container.arxml"]);
+    assert_eq!(
+        decoded,
+        "(1.000000) can0 123 Box: Counter = 7, Engine.Counter = 8, Engine.Speed = 500\n\
+         (1.020000) can0 123 Box: Counter = 7, Engine.Counter = 9, Engine.Speed = 501\n"
+    );
+    assert!(err.contains("not decoded: contained PDUs that the databases do not have (1)"), "{err}");
+    let (json, _) =
+        cantap(&["decode", "trace.log", "--db", "container.arxml", "--json", "--signal", "Engine.Speed"]);
+    assert!(
+        json.contains("\"signals\":{\"Engine.Speed\":501}")
+            && json.contains("\"not_decoded\":{\"contained PDUs"),
+        "{json}"
+    );
+    let (coverage, _) = cantap(&["db", "container.arxml", "--coverage", "trace.log"]);
+    let rows = "In containers:\n  Box 010203           2  Engine\n  Box 040506           0  Brake\n  Box 0A0B0C           1  (not in the databases)\n";
+    assert!(coverage.ends_with(rows), "{coverage}");
+    let (found, _) = cantap(&["search", "trace.log", "Engine.Speed > 500", "--db", "container.arxml"]);
+    assert!(found.contains("1.020000") && !found.contains("1.000000"), "{found}");
+}

@@ -37,7 +37,8 @@ use crate::trace_output::{TraceOutput, named};
     csv-gvret (SavvyCAN's), pcapng, mf4, dif. Only read: pcap, candump-screen, busmaster, crtd, kvaser, canking, microchip, \
     canhacker, printer and sqlite (python-can's).\n\n\
     What OUT cannot carry is counted on standard error. Exit code 1: IN or OUT failed, nothing in IN could be read, or \
-    with --strict something in IN was wrong. An older OUT then stays as it is; what had come from a pipe is kept.")]
+    with --strict something in IN was wrong. An older OUT then stays as it is; what had come from a pipe is kept. \
+    Otherwise the new OUT takes its place: a conversion can be made again. A recording cannot, so capture asks for --force.")]
 pub struct Args {
     /// The trace to read; - for standard input.
     #[arg(value_name = "IN")]

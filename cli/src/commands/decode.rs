@@ -20,7 +20,7 @@ use std::process::ExitCode;
 use std::sync::Arc;
 
 use cantap::{TraceEvent, TraceRecord};
-use cantap_signals::{Decoder, SignalValue};
+use cantap_signals::{Decoder, NotDecoded, SignalValue};
 
 use self::decoded::Decoded;
 use self::output::{Form, Output};
@@ -35,6 +35,9 @@ struct Count {
     decoded: u64,
     values: u64,
     lost: u64,
+    /// What frames with containers have besides these values.
+    #[serde(skip)]
+    not_decoded: NotDecoded,
     /// Number of events, with `--protocols`.
     #[serde(skip_serializing_if = "is_zero")]
     events: u64,
@@ -60,15 +63,23 @@ pub fn run(args: &Args) -> anyhow::Result<ExitCode> {
     let count = decode(args, &decoder, &mut records, &mut output)?;
     let mut summary = serde_json::to_value(&count)?;
     records.missing().put_into(&mut summary);
+    let not_decoded: serde_json::Map<_, _> =
+        count.not_decoded.iter().map(|(what, count)| (what.to_owned(), count.into())).collect();
+    if !not_decoded.is_empty() {
+        summary["not_decoded"] = not_decoded.into();
+    }
     let left_out = output.left_out();
     output.finish(&summary)?;
-    let Count { frames, decoded, values, lost, events } = count;
+    let Count { frames, decoded, values, lost, not_decoded, events } = count;
     let said = if args.protocols { format!(", {events} events of protocols") } else { String::new() };
     eprintln!("cantap: decoded {decoded} of {frames} frames, {values} values{said}");
     if left_out > 0 {
         eprintln!(
             "cantap: {left_out} values of protocols are texts or bytes, which a table of numbers has no columns for; --csv without --wide has them"
         );
+    }
+    for (what, count) in not_decoded.iter() {
+        eprintln!("cantap: not decoded: {what} ({count})");
     }
     if lost > 0 {
         eprintln!("cantap: {lost} frames or more are missing in the trace");
@@ -135,6 +146,7 @@ fn one(
     if values.is_empty() && !args.signals.is_empty() {
         return Ok(());
     }
+    decoder.count_not_decoded(reference, frame.data(), &mut count.not_decoded);
     count.decoded += 1;
     count.values += values.len() as u64;
     output.push(&Decoded { record, frame, reference, message: decoder.message(reference), values })

@@ -158,7 +158,8 @@ proptest! {
         for (at, signal) in signals.iter_mut().enumerate() {
             signal.name = format!("S{at}");
         }
-        let message = Message { id, name, description, length: 8, cycle_ms: None, j1939, signals, line: 0 };
+        let (cycle_ms, container) = (None, None);
+        let message = Message { id, name, description, length: 8, cycle_ms, j1939, container, signals, line: 0 };
         let database = Database { messages: vec![message], ..Database::default() };
         let mut decoder = Decoder::new(vec![Source { channel: None, database }]);
         decoder.retain(|_, index, _| chosen[index]);

@@ -16,6 +16,7 @@ pub(crate) use decode::{RowDecoder, date};
 pub(crate) use encode::{Cell, Layout, TableEncoder, TableRow};
 pub use style::{DifConvention, LineEnd, TableStyle};
 
+use cantap_trace::TraceEvent;
 use cantap_wire::record::BusErrorKind;
 
 /// The names of the columns.
@@ -49,13 +50,16 @@ pub(crate) const COLUMNS: [&str; 23] = [
 const ERRORS: [BusErrorKind; 4] =
     [BusErrorKind::Acknowledgment, BusErrorKind::Form, BusErrorKind::Crc, BusErrorKind::Stuff];
 
+/// What the mark of a loss says: not how many, not where.
+const OVERRUN: TraceEvent = TraceEvent::Lost { stage: None, count: 1, at_least: true };
+
 #[cfg(test)]
 mod tests {
     use super::super::tests;
     use super::*;
     use crate::{CsvDialect, Format, WriteOptions};
     use cantap_trace::testing::{frame, record};
-    use cantap_trace::{Direction, TraceEvent, TraceRecord};
+    use cantap_trace::{Direction, TraceRecord};
     use proptest::prelude::*;
 
     const CSV: Format = Format::Csv(CsvDialect::Analyser);

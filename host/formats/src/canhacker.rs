@@ -38,17 +38,18 @@ impl RowFormat for Decoder {
         let mark = if time.contains(&b',') { b',' } else { b'.' };
         let fault = || Fault::malformed("a line such as '00.000 301 2 A6 07'", line);
         let shown_ns = text::time(time, NS_PER_S, mark).filter(|time| *time >= 0).ok_or_else(fault)?;
+        // Also of a line that cannot be read further: the next one counts from it.
+        if shown_ns < self.last_ns {
+            self.minutes_ns = self.minutes_ns.saturating_add(NS_PER_MINUTE);
+            self.note = Some(MINUTES);
+        }
+        self.last_ns = shown_ns;
         let raw = text::hex(id).ok_or_else(|| Fault::malformed("an identifier in hexadecimal digits", id))?;
         let id = identifier(raw, id.len() > 4, id)?;
         let len = length_code(len)?;
         let fields = FrameFields { id, remote: false, direction: Direction::Rx, len, fd: None };
         let data = Payload::exactly(words, fields.data_len(), hex_byte)?;
         let event = fields.event(&data)?;
-        if shown_ns < self.last_ns - NS_PER_MINUTE / 2 {
-            self.minutes_ns = self.minutes_ns.saturating_add(NS_PER_MINUTE);
-            self.note = Some(MINUTES);
-        }
-        self.last_ns = shown_ns;
         let time_ns = self.minutes_ns.saturating_add(shown_ns);
         Ok(Line::Record(TraceRecord { time_ns, channel: 1, event }))
     }
@@ -80,6 +81,20 @@ mod tests {
         for file in [file.replace("0.5", "0,5").replace("9.9", "9,9").replace("0.1", "0,1"), file] {
             let (records, issues) = tests::read(Format::CanHacker, file);
             assert_eq!(issues, Vec::<String>::new());
+            assert_eq!(tests::write(Format::Candump, &records), expected);
+        }
+    }
+
+    #[test]
+    fn a_minute_that_begins_behind_a_broken_line_or_a_pause_is_counted() {
+        for (rows, expected) in [
+            (
+                "00.500 123 1 11 \n59.900 12G 1 A6 \n00.100 301 0 \n",
+                "(0.500000) can0 123#11\n(60.100000) can0 301#\n",
+            ),
+            ("00.500 123 1 11 \n00.100 301 0 \n", "(0.500000) can0 123#11\n(60.100000) can0 301#\n"),
+        ] {
+            let (records, _) = tests::read(Format::CanHacker, format!("{HEAD}{rows}"));
             assert_eq!(tests::write(Format::Candump, &records), expected);
         }
     }

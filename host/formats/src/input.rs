@@ -6,6 +6,7 @@ use std::io::{self, Read};
 use std::path::Path;
 use std::time::Duration;
 
+use super::carriage_return::{self, ToLineFeed};
 use super::compression::{self, Compression};
 use super::found::Found;
 use super::issue::{Fault, Place};
@@ -130,6 +131,12 @@ impl Input {
         if let Some(order) = Utf16::of_content(input.peek(utf16::HEAD_BYTES)?) {
             let follow = input.follow;
             input = Self::new(Box::new(ToUtf8::new(input.into_rest(), order, follow)), follow);
+            input.is_as_it_is = false;
+        }
+        // Only what is there is looked at: more may be long in coming.
+        if carriage_return::ends_lines(input.buffered()) {
+            let follow = input.follow;
+            input = Self::new(Box::new(ToLineFeed(input.into_rest())), follow);
             input.is_as_it_is = false;
         }
         input.without_byte_order_mark()
@@ -381,6 +388,15 @@ mod tests {
         for bytes in [marked, [&[0xFE, 0xFF][..], &big].concat(), little, big, packed] {
             assert_eq!(lines(input(bytes)), [(1, "a".into(), true), (2, "µ".into(), true)]);
         }
+    }
+
+    #[test]
+    fn lines_that_end_with_a_carriage_return_alone_are_lines() {
+        let expected = [(1, "a".into(), true), (2, "b".into(), true)];
+        assert_eq!(lines(input(b"a\rb\r".to_vec())), expected);
+        assert_eq!(lines(input(b"a\r\nb\r\n".to_vec())), expected);
+        // Bytes of something else are left alone.
+        assert_eq!(lines(input(b"\0\r\r\n".to_vec())), [(1, "\0\r".into(), true)]);
     }
 
     #[cfg(feature = "zstd")]

@@ -19,6 +19,7 @@ mod candump;
 mod candump_screen;
 mod canhacker;
 mod canking;
+mod carriage_return;
 mod codec;
 mod compressed;
 mod compression;

@@ -2,8 +2,8 @@
 //! `CAN_RemoteFrame` and `CAN_ErrorFrame` with their parts, which ASAM's *Bus Logging* gives such records.
 //!
 //! A file consists of linked blocks, so it needs random access and cannot be read as a stream. Supported are sorted and unsorted groups; data in one
-//! block or in lists, compressed by deflate, zstd or LZ4, transposed or not; bytes inside or outside the records; and unfinished files. Data stored
-//! in columns (4.2), whose times are in another group, are not supported. Measured signals are counted.
+//! block or in lists, compressed by deflate, zstd or LZ4, transposed or not; bytes inside or outside the records; times in another group (the columns
+//! of 4.2); and unfinished files. Measured signals are counted.
 
 mod blocks;
 mod decode;

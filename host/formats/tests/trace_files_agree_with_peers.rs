@@ -194,6 +194,34 @@ fn we_read_every_message_of_the_files_that_python_can_writes() {
     }
 }
 
+/// Times in one group, frames in another, a measured signal in a third.
+#[test]
+fn we_read_the_columns_that_asammdf_writes() {
+    let directory = directory("asammdf_columns");
+    let mut records = frames_of_every_kind(&directory);
+    records.retain(|record| record.frame().is_some_and(|frame| !frame.is_remote()));
+    let source = directory.join("messages.txt");
+    fs::write(&source, lines(&records, EVERYTHING).join("\n")).unwrap();
+    // Plain, deflated, and with rows and columns exchanged before.
+    let paths = ["c0.mf4", "c1.mf4", "c2.mf4"].map(|name| directory.join(name));
+    let arguments: Vec<_> = std::iter::once(&source).chain(&paths).map(PathBuf::as_path).collect();
+    if python_can(&arguments, "columns").is_none() {
+        return;
+    }
+    for path in &paths {
+        let bytes = fs::read(path).unwrap();
+        let has = |name: &[u8]| bytes.windows(4).any(|window| window == name);
+        assert!(has(b"##LD") && !has(b"##DL"), "{}: asammdf wrote no columns", path.display());
+        let (read, issues) = read(path);
+        assert_eq!(issues, Vec::<String>::new(), "{}", path.display());
+        let (ours, expected) = (lines(&read, EVERYTHING), lines(&records, EVERYTHING));
+        for (at, (ours, expected)) in ours.iter().zip(&expected).enumerate() {
+            assert_eq!(ours, expected, "{}, frame {at}", path.display());
+        }
+        assert_eq!(ours.len(), expected.len(), "{}", path.display());
+    }
+}
+
 #[test]
 fn python_can_reads_the_fd_frames_of_our_mf4() {
     let directory = directory("mf4_fd");

@@ -2,6 +2,7 @@
 
 dump FILE...             prints "file PATH", then one line for each message
 write LINES FILE...      writes the messages of such lines into each file, format by suffix
+columns LINES FILE...    writes its data frames with asammdf in columns, as MDF 4.2 has them
 
 A line is: microseconds, channel from 1 (0 where the format has none), Rx or Tx, data, remote, error or fd,
 identifier in hexadecimal, x if it is extended, length, bytes in hexadecimal; of CAN FD the flags: 1 for a switched
@@ -58,7 +59,7 @@ def dump(paths):
             print(line(message, suffix))
 
 
-def write(lines, paths):
+def messages_of(lines):
     messages = []
     for text in Path(lines).read_text().splitlines():
         micros, channel, direction, kind, *rest = text.split()
@@ -82,6 +83,11 @@ def write(lines, paths):
                 **common,
             )
         )
+    return messages
+
+
+def write(lines, paths):
+    messages = messages_of(lines)
     for path in paths:
         # Only the candump log and printed output name interfaces; MF4 counts from 1.
         named = suffix_of(path) in (".log", ".txt")
@@ -96,9 +102,48 @@ def write(lines, paths):
                 message.channel = number
 
 
+def columns(lines, paths):
+    import datetime
+
+    import asammdf
+    import numpy
+    from can.io.mf4 import STD_DTYPE, SourceInformation
+    from can.util import len2dlc
+
+    class Signal(asammdf.Signal):
+        """asammdf 8.8 asks for these of what it writes in columns, and does not make them."""
+
+        axes = conversions = units = None
+
+    messages = [message for message in messages_of(lines) if not (message.is_error_frame or message.is_remote_frame)]
+    records = numpy.zeros(len(messages), STD_DTYPE)
+    for record, message in zip(records, messages):
+        values = {"BusChannel": message.channel + 1, "ID": message.arbitration_id, "IDE": message.is_extended_id}
+        values.update(DLC=len2dlc(message.dlc) if message.is_fd else message.dlc, DataLength=len(message.data))
+        values.update(Dir=not message.is_rx, EDL=message.is_fd, BRS=message.bitrate_switch, ESI=message.error_state_indicator)
+        for name, value in values.items():
+            record[f"CAN_DataFrame.{name}"] = value
+        record["CAN_DataFrame.DataBytes"][: len(message.data)] = list(message.data)
+    start = datetime.datetime.fromtimestamp(int(messages[0].timestamp), datetime.timezone.utc)
+    times = numpy.array([message.timestamp - start.timestamp() for message in messages])
+    source = SourceInformation(source_type=2, bus_type=2)
+    for path in paths:
+        mdf = asammdf.MDF(version="4.20")
+        # No option of the class that makes new files turns it on, and blocks would be larger than these files.
+        inner = getattr(mdf, "_mdf", mdf)
+        inner._column_storage, inner._write_fragment_size = True, 4096
+        mdf.header.start_time = start
+        frames = Signal(name="CAN_DataFrame", samples=records, timestamps=times, source=source)
+        speed = Signal(name="Speed", samples=times, timestamps=times)
+        mdf.append([frames, speed], acq_source=source)
+        mdf.save(path, compression=int(Path(path).stem[-1]), overwrite=True)
+
+
 if __name__ == "__main__":
     command, *arguments = sys.argv[1:]
     if command == "dump":
         dump(arguments)
+    elif command == "columns":
+        columns(arguments[0], arguments[1:])
     else:
         write(arguments[0], arguments[1:])

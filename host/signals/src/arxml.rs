@@ -1,14 +1,16 @@
 //! Databases from ARXML files, AUTOSAR's system descriptions of version 3 and 4.
 //!
 //! A frame's identifier is where a CAN channel sends it, its signals are in the PDUs mapped into it, and how their bits become values is in yet
-//! other places, all named by paths. Of a secured PDU, the payload is read and what follows it: freshness value and authenticator. The content of a
-//! container PDU differs from frame to frame, so it is not read: such frames keep their other content, with a warning.
+//! other places, all named by paths. Of a secured PDU, the payload is read and what follows it: freshness value and authenticator.
+
+mod container;
 
 use std::collections::{HashMap, HashSet};
 
 use cantap_wire::Id;
 use roxmltree::{Document, Node};
 
+use super::container::Container;
 use super::fault::{DatabaseError, Fault, FaultKind};
 use super::layout::{self, ByteOrder};
 use super::model::{Database, Message, Multiplexed, Signal, ValueKind, ValueTable};
@@ -132,6 +134,10 @@ struct Target<'m> {
     offset: u16,
     signals: Vec<Signal>,
     cycle_ms: Option<u32>,
+    /// The container that is in the frame.
+    container: Option<Container>,
+    /// The contained PDU that is being read.
+    contained: Option<String>,
     /// How deeply nested the current PDU is, and how many have been read for this frame.
     depth: u32,
     pdus: u32,
@@ -199,8 +205,16 @@ impl<'a> Reader<'a> {
             fault(FaultKind::MessageLength(length.unsigned_abs()));
             return None;
         };
-        let mut target =
-            Target { name: &name, offset: 0, signals: Vec::new(), cycle_ms: None, depth: 0, pdus: 0 };
+        let mut target = Target {
+            name: &name,
+            offset: 0,
+            signals: Vec::new(),
+            cycle_ms: None,
+            container: None,
+            contained: None,
+            depth: 0,
+            pdus: 0,
+        };
         let mappings = within(frame, "PDU-TO-FRAME-MAPPING");
         for mapping in mappings.collect::<Vec<_>>() {
             let start =
@@ -219,13 +233,14 @@ impl<'a> Reader<'a> {
                 return None;
             }
         }
-        let Target { signals, cycle_ms, .. } = target;
+        let Target { signals, cycle_ms, container, .. } = target;
         Some(Message {
             id,
             description: description(frame),
             length,
             cycle_ms,
             j1939: false,
+            container,
             signals,
             line,
             name,
@@ -256,14 +271,7 @@ impl<'a> Reader<'a> {
     ) -> Result<(), (Node<'a, 'a>, FaultKind)> {
         match pdu.tag_name().name() {
             "MULTIPLEXED-I-PDU" => self.multiplexed(pdu, target),
-            "CONTAINER-I-PDU" => {
-                let name = short_name(pdu);
-                let reason = format!(
-                    "{name} is a container PDU: the frame itself says what it contains, which is not read"
-                );
-                self.warn(pdu, target.name, &reason);
-                Ok(())
-            }
+            "CONTAINER-I-PDU" => self.container(pdu, target),
             "SECURED-I-PDU" => self.secured(pdu, target),
             _ => {
                 target.cycle_ms = target.cycle_ms.or_else(|| cycle_ms(pdu));
@@ -347,7 +355,11 @@ impl<'a> Reader<'a> {
                 order: ByteOrder::Big,
                 line: self.line(pdu),
                 // The most significant bit comes first.
-                ..Signal::new(format!("{}_{name}", target.name), first / 8 * 8 + 7 - first % 8, length)
+                ..Signal::new(
+                    format!("{}_{name}", target.contained.as_deref().unwrap_or(target.name)),
+                    first / 8 * 8 + 7 - first % 8,
+                    length,
+                )
             });
             at = at.and_then(|at| at.checked_add(length));
         }

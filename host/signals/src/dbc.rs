@@ -228,6 +228,7 @@ impl<'a> Reader<'a> {
             length,
             cycle_ms: extras.cycle_ms.filter(|&cycle| cycle > 0),
             j1939: id.is_extended() && format.map_or(self.j1939, is_j1939),
+            container: None,
             signals,
             line,
         })

@@ -45,13 +45,14 @@ const NEEDLESS: &[&str] = &[
 /// Statements that do.
 const NEEDED: &[&str] = &["BO_", "SG_", "VAL_", "SIG_VALTYPE_", "SG_MUL_VAL_"];
 
-/// DBC files are in Windows' Western code page; newer tools write UTF-8.
+/// DBC files are in Windows' Western code page; newer tools write UTF-8. Lines that end with a carriage return alone get a line feed.
 pub fn decode(bytes: &[u8]) -> Cow<'_, str> {
     let bytes = bytes.strip_prefix(b"\xEF\xBB\xBF").unwrap_or(bytes);
-    match str::from_utf8(bytes) {
+    let text = match str::from_utf8(bytes) {
         Ok(text) => Cow::Borrowed(text),
         Err(_) => can_dbc::encodings::WINDOWS_1252.decode_without_bom_handling(bytes).0,
-    }
+    };
+    if text.contains('\r') && !text.contains('\n') { text.replace('\r', "\n").into() } else { text }
 }
 
 /// A statement's place in the text.

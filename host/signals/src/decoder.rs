@@ -6,6 +6,7 @@ use cantap_trace::TraceFrame;
 use cantap_wire::Id;
 use rustc_hash::FxHashMap;
 
+use super::container::NotDecoded;
 use super::model::{Database, Message, Signal};
 use super::plan::{MessagePlan, MessageRows, SignalValue};
 use super::select::{Selection, SelectionError};
@@ -258,6 +259,13 @@ impl Decoder {
         let place = self.find(channel, frame.id())?;
         self.decode_data(place, frame.data(), values);
         Some(place)
+    }
+
+    /// Adds what of this data the message's container has beside its values.
+    pub fn count_not_decoded(&self, message: MessageRef, data: &[u8], counts: &mut NotDecoded) {
+        if let Some(container) = &self.message(message).container {
+            counts.add(container, data);
+        }
     }
 
     /// For decoding frames of this message together: much faster than one by one if columns are needed.

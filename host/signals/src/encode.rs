@@ -73,6 +73,9 @@ fn find_message(decoder: &Decoder, channel: Option<u8>, name: &str) -> Result<Me
 
 /// Makes a message's data, as many bytes as the message has.
 pub fn encode_message(message: &Message, inputs: &[(String, Input)]) -> Result<Vec<u8>, EncodeError> {
+    if message.container.is_some() {
+        return Err(EncodeError::Container(message.name.clone()));
+    }
     let mut raws = BTreeMap::new();
     for (name, input) in inputs {
         let place = place_of(message, name, inputs)?;

@@ -247,6 +247,7 @@ fn message(entry: MessageEntry, line: u32, bytes: &[u8], faults: &mut Vec<Fault>
         length,
         cycle_ms: entry.cycle_ms,
         j1939: entry.j1939 && id.is_extended(),
+        container: None,
         signals,
         line,
     })

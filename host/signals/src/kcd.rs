@@ -104,7 +104,8 @@ fn message(document: &Document, node: Node, faults: &mut Vec<Fault>) -> Option<M
     };
     let cycle_ms =
         node.attribute("interval").and_then(|interval| interval.parse().ok()).filter(|&cycle| cycle > 0);
-    Some(Message { id, name, description: notes(node), length, cycle_ms, j1939: false, signals, line })
+    let (description, container) = (notes(node), None);
+    Some(Message { id, name, description, length, cycle_ms, j1939: false, container, signals, line })
 }
 
 /// A multiplexer and the signals of its groups.

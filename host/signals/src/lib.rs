@@ -12,6 +12,7 @@ pub mod arxml;
 mod buses;
 mod clean;
 pub mod condition;
+mod container;
 pub mod dbc;
 mod dbc_parse;
 mod dbc_text;
@@ -36,6 +37,7 @@ mod xml;
 
 use std::path::Path;
 
+pub use container::{ContainedPdu, Container, ContainerHeader, InPdu, NotDecoded, Part};
 pub use decoder::{Decoder, MessageRef, Override, Source};
 pub use encode::{EncodeError, Encoded};
 pub use fault::{DatabaseError, Fault, FaultKind};

@@ -8,6 +8,7 @@ use std::str::FromStr;
 use cantap_wire::Id;
 
 use super::clean;
+use super::container::{Container, InPdu};
 use super::fault::Fault;
 use super::layout::{self, ByteOrder};
 use super::number::Number;
@@ -41,6 +42,8 @@ pub struct Message {
     pub cycle_ms: Option<u32>,
     /// Whether it is a J1939 parameter group: priority and source address are ignored when matching.
     pub j1939: bool,
+    /// What of it says anew in each frame which PDUs are in it, if something does.
+    pub container: Option<Container>,
     /// Its signals, in the file's order.
     pub signals: Vec<Signal>,
     /// The line in the file, from 1; 0 if there is none.
@@ -48,6 +51,13 @@ pub struct Message {
 }
 
 impl Message {
+    /// The bytes that a signal may lie in: those of the message, or of the PDU that it is in.
+    pub(super) fn room_of(&self, signal: &Signal) -> u16 {
+        let pdu = signal.contained.as_ref().zip(self.container.as_ref());
+        let pdu = pdu.and_then(|(pdu, container)| container.pdus.get(pdu.place));
+        pdu.map_or(self.length, |pdu| pdu.length)
+    }
+
     /// The signal with that name.
     pub fn signal(&self, name: &str) -> Option<&Signal> {
         self.signals.iter().find(|signal| signal.name == name)
@@ -82,6 +92,8 @@ pub struct Signal {
     pub max: Option<f64>,
     /// Texts for raw values.
     pub values: ValueTable,
+    /// The PDU of the message's container that it is in, if it is in one: its place counts from that one's first byte.
+    pub contained: Option<InPdu>,
     /// When the signal is present, if not always.
     pub multiplexed: Option<Multiplexed>,
     /// Whether other signals depend on its value.
@@ -276,6 +288,7 @@ impl Signal {
             min: None,
             max: None,
             values: ValueTable::default(),
+            contained: None,
             multiplexed: None,
             is_switch: false,
             initial_raw: 0,
@@ -287,12 +300,24 @@ impl Signal {
         }
     }
 
-    /// Its name, followed by a number (`Speed#2`) if a frame may carry another signal with this name.
+    /// Its name, preceded by that of its contained PDU (`Status.Speed`) and followed by a number (`Speed#2`) if a frame may carry another signal
+    /// with this name.
     pub fn label(&self) -> Cow<'_, str> {
+        let name = match &self.contained {
+            None => Cow::Borrowed(self.name.as_str()),
+            Some(pdu) => format!("{}.{}", pdu.name, self.name).into(),
+        };
         match self.twins_before {
-            0 => Cow::Borrowed(&self.name),
-            before => format!("{}#{}", self.name, before + 1).into(),
+            0 => name,
+            before => format!("{name}#{}", before + 1).into(),
         }
+    }
+
+    /// Whether `of` is the name of what it is in: its message, or its contained PDU, with or without its message in front.
+    pub(super) fn is_in(&self, of: &str, message: &Message) -> bool {
+        let Some(pdu) = &self.contained else { return of == message.name };
+        let inner = of.strip_prefix(message.name.as_str()).and_then(|rest| rest.strip_prefix('.'));
+        of == pdu.name || inner == Some(pdu.name.as_str())
     }
 
     /// How many data bytes a frame must have to hold it.

@@ -16,8 +16,11 @@ impl Message {
         for place in 0..self.signals.len() {
             let Some(chain) = self.chain(place) else { continue };
             let page = (0..self.signals.len()).filter(|&other| {
-                self.chain(other)
-                    .is_some_and(|others| others.is_empty() || others.iter().all(|link| chain.contains(link)))
+                let is_beside = self.signals[other].contained == self.signals[place].contained;
+                is_beside
+                    && self.chain(other).is_some_and(|others| {
+                        others.is_empty() || others.iter().all(|link| chain.contains(link))
+                    })
             });
             let page: Vec<_> = page.collect();
             if !leaves.contains(&page) {
@@ -50,7 +53,8 @@ impl Message {
     pub fn layout_picture(&self, signals: &[usize]) -> String {
         let chosen: Vec<&Signal> = signals.iter().filter_map(|&place| self.signals.get(place)).collect();
         let needed = chosen.iter().map(|signal| signal.bytes_needed()).max().unwrap_or(0);
-        let bytes = needed.max(u32::from(self.length.min(8)));
+        let room = chosen.first().map_or(self.length, |signal| self.room_of(signal));
+        let bytes = needed.max(u32::from(room.min(8)));
         let mut owners: Vec<Vec<usize>> = vec![Vec::new(); bytes as usize * 8];
         for (index, signal) in chosen.iter().enumerate() {
             for bit in bits(signal) {

@@ -32,6 +32,8 @@ pub struct SignalValue {
 #[derive(Clone, Debug)]
 pub struct MessagePlan {
     groups: Vec<Group>,
+    /// The same for each PDU that the message may contain.
+    contained: Vec<Vec<Group>>,
 }
 
 #[derive(Clone, Debug)]
@@ -127,7 +129,9 @@ impl Field {
 impl MessagePlan {
     /// Compiles those signals of `message` that `wanted` accepts.
     pub fn new(message: &Message, wanted: impl Fn(usize, &Signal) -> bool) -> Self {
-        let mut groups: Vec<Group> = Vec::new();
+        let mut own: Vec<Group> = Vec::new();
+        let pdus = message.container.as_ref().map_or(0, |container| container.pdus.len());
+        let mut contained: Vec<Vec<Group>> = vec![Vec::new(); pdus];
         for (index, signal) in message.signals.iter().enumerate() {
             let (Some(field), true) = (Field::of(signal), wanted(index, signal)) else { continue };
             let Some(conditions) = conditions(&message.signals, signal) else { continue };
@@ -144,33 +148,53 @@ impl MessagePlan {
             };
             let (scale, indicates) = (signal.scale(), message.j1939);
             let plan = SignalPlan { field, conversion, index: index as u32, scale, indicates };
+            let groups = match &signal.contained {
+                None => &mut own,
+                Some(pdu) => match contained.get_mut(pdu.place) {
+                    Some(groups) => groups,
+                    None => continue,
+                },
+            };
             match groups.iter_mut().find(|group| group.conditions == conditions) {
                 Some(group) => group.signals.push(plan),
                 None => groups.push(Group { conditions, signals: vec![plan] }),
             }
         }
-        Self { groups }
+        Self { groups: own, contained }
     }
 
     /// Whether there is nothing to decode.
     pub fn is_empty(&self) -> bool {
-        self.groups.is_empty()
+        self.groups.is_empty() && self.contained.iter().all(Vec::is_empty)
     }
 
-    /// Appends every signal that is present and fits `data`.
+    /// Appends every signal that is present and fits `data`. If a PDU is contained several times, the last one counts.
     pub fn decode(&self, message: &Message, data: &[u8], values: &mut Vec<SignalValue>) {
-        let payload = if data.len() <= 8 {
-            let mut padded = [0; 8];
-            padded[..data.len()].copy_from_slice(data);
-            let (little, big) = (u64::from_le_bytes(padded), u64::from_be_bytes(padded));
-            Payload::Frame { little, big, len: data.len() as u8 }
-        } else {
-            Payload::Long(data)
-        };
-        for group in &self.groups {
-            if group.holds(payload) {
-                values.extend(group.signals.iter().filter_map(|plan| plan.decode(message, payload)));
+        decode_groups(&self.groups, message, data, values);
+        let Some(container) = &message.container else { return };
+        let mut parts = container.parts(data);
+        while let Some(part) = parts.next() {
+            let groups = part.pdu.and_then(|pdu| self.contained.get(pdu)).filter(|groups| !groups.is_empty());
+            if let Some(groups) = groups.filter(|_| parts.clone().all(|later| later.pdu != part.pdu)) {
+                decode_groups(groups, message, part.data, values);
             }
+        }
+    }
+}
+
+/// Appends every signal of these groups that is there and fits `data`.
+fn decode_groups(groups: &[Group], message: &Message, data: &[u8], values: &mut Vec<SignalValue>) {
+    let payload = if data.len() <= 8 {
+        let mut padded = [0; 8];
+        padded[..data.len()].copy_from_slice(data);
+        let (little, big) = (u64::from_le_bytes(padded), u64::from_be_bytes(padded));
+        Payload::Frame { little, big, len: data.len() as u8 }
+    } else {
+        Payload::Long(data)
+    };
+    for group in groups {
+        if group.holds(payload) {
+            values.extend(group.signals.iter().filter_map(|plan| plan.decode(message, payload)));
         }
     }
 }

@@ -8,8 +8,8 @@ use super::model::{Message, Signal};
 
 /// Patterns for signals; without any, all signals are selected.
 ///
-/// A pattern with a dot is matched against `Message.Signal`, one without against the signal's name. `*`
-/// matches any text, `?` one character, `[a-z]` one of several. Matching is case-sensitive.
+/// A pattern with a dot is matched against `Message.Signal` (for a signal in a contained PDU against `Pdu.Signal` and `Message.Pdu.Signal`),
+/// one without against the signal's name. `*` matches any text, `?` one character, `[a-z]` one of several. Matching is case-sensitive.
 #[derive(Clone, Debug, Default)]
 pub struct Selection {
     patterns: Vec<Pattern>,
@@ -53,9 +53,11 @@ impl Selection {
         self.patterns.is_empty() || self.patterns.iter().any(|pattern| matches(pattern, message, signal))
     }
 
-    /// Whether a pattern matches the message's name.
+    /// Whether a pattern matches the message's name, or that of a PDU it may contain.
     pub fn names(&self, message: &Message) -> bool {
-        self.patterns.iter().any(|pattern| pattern.matches(&message.name))
+        let pdus = message.container.iter().flat_map(|container| &container.pdus);
+        let mut names = std::iter::once(&message.name).chain(pdus.map(|pdu| &pdu.name));
+        names.any(|name| self.patterns.iter().any(|pattern| pattern.matches(name)))
     }
 
     /// Fails if one of the patterns selects nothing in these messages, which is most likely a typing error.
@@ -80,7 +82,11 @@ impl Selection {
 
 fn matches(pattern: &Pattern, message: &Message, signal: &Signal) -> bool {
     if pattern.as_str().contains('.') {
-        pattern.matches(&format!("{}.{}", message.name, signal.name))
+        let is_named = |of: &str| pattern.matches(&format!("{of}.{}", signal.name));
+        match &signal.contained {
+            None => is_named(&message.name),
+            Some(pdu) => is_named(&pdu.name) || is_named(&format!("{}.{}", message.name, pdu.name)),
+        }
     } else {
         pattern.matches(&signal.name)
     }

@@ -403,6 +403,7 @@ fn messages_of(group: &[Block], faults: &mut Vec<Fault>) -> Vec<Message> {
             length,
             cycle_ms: head.cycle_ms,
             j1939: false,
+            container: None,
             signals: signals.clone(),
             line: head.line,
         });

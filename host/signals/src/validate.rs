@@ -12,6 +12,8 @@ pub const MAX_BYTES: u16 = 1785;
 /// Makes a database from messages. Those with a fault that would make values wrong are left out with a warning; if nothing is
 /// left and something was wrong, it is an error.
 pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Result<Database, DatabaseError> {
+    // What was not understood may have been all of its messages.
+    let is_without_messages = messages.is_empty();
     let mut usable = Vec::with_capacity(messages.len());
     for mut message in messages {
         let before = faults.len();
@@ -22,7 +24,11 @@ pub fn finish(file: &str, messages: Vec<Message>, mut faults: Vec<Fault>) -> Res
     }
     check_ids(&usable, &mut faults);
     faults.sort_by_key(|fault| fault.line);
-    let is_serious = |fault: &Fault| !fault.kind.is_warning() || matches!(fault.kind, FaultKind::LeftOut(_));
+    let is_serious = |fault: &Fault| {
+        !fault.kind.is_warning()
+            || matches!(fault.kind, FaultKind::LeftOut(_))
+            || is_without_messages && matches!(fault.kind, FaultKind::Ignored(_))
+    };
     if usable.is_empty() && faults.iter().any(is_serious) {
         faults.retain(is_serious);
         for fault in &mut faults {
@@ -67,8 +73,15 @@ fn tidy(database: &mut Database) {
     for message in &mut database.messages {
         clean::make(&mut message.name, clean::line);
         clean::make(&mut message.description, clean::lines);
+        for pdu in message.container.iter_mut().flat_map(|container| &mut container.pdus) {
+            clean::make(&mut pdu.name, clean::line);
+            clean::make(&mut pdu.description, clean::lines);
+        }
         for signal in &mut message.signals {
             clean::make(&mut signal.name, clean::line);
+            if let Some(pdu) = &mut signal.contained {
+                clean::make(&mut pdu.name, clean::line);
+            }
             clean::make(&mut signal.unit, clean::line);
             clean::make(&mut signal.description, clean::lines);
             signal.values.clean();
@@ -79,9 +92,10 @@ fn tidy(database: &mut Database) {
 
 /// Numbers signals with the same name that one frame may carry together.
 fn number_twins(message: &mut Message) {
-    let mut by_name: HashMap<&str, Vec<usize>> = HashMap::new();
+    let mut by_name: HashMap<_, Vec<usize>> = HashMap::new();
     for (place, signal) in message.signals.iter().enumerate() {
-        by_name.entry(&signal.name).or_default().push(place);
+        let pdu = signal.contained.as_ref().map(|pdu| pdu.place);
+        by_name.entry((pdu, &signal.name)).or_default().push(place);
     }
     let mut numbers = Vec::new();
     for places in by_name.into_values().filter(|places| places.len() > 1) {
@@ -125,7 +139,8 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
     };
     let mut names = HashSet::new();
     for signal in &message.signals {
-        if !names.insert(signal.name.as_str()) {
+        let pdu = signal.contained.as_ref().map(|pdu| pdu.place);
+        if !names.insert((pdu, signal.name.as_str())) {
             report(signal, FaultKind::DuplicateSignal);
         }
         let length_fits = match signal.kind {
@@ -146,7 +161,8 @@ fn check_message(message: &mut Message, faults: &mut Vec<Fault>) {
         } else if factor == 0.0 {
             report(signal, FaultKind::ZeroFactor);
         }
-        let (needed, length) = (signal.bytes_needed(), message.length);
+        let length = message.room_of(signal);
+        let needed = signal.bytes_needed();
         if needed > length.into() {
             report(signal, FaultKind::OutsideMessage { needed, length });
         }

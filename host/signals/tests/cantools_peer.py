@@ -1,13 +1,15 @@
 """cantools' decoded values, as JSON lines, for tests/signals_agree_with_cantools.rs.
 
-    cantools_peer.py decode FILE...    100 random payloads per message of each database
+    cantools_peer.py decode FILE...    $PAYLOADS random payloads, or 100, per message of each database
     cantools_peer.py files DIR         fetch cantools' source from PyPI and print its test files
+    cantools_peer.py others DIR        as files, the databases of canmatrix and opendbc
 
 Values are printed as text: integers of any size, floats with every digit.
 """
 
 import contextlib
 import json
+import os
 import pathlib
 import random
 import subprocess
@@ -15,7 +17,7 @@ import sys
 import tarfile
 from importlib.metadata import version
 
-PAYLOADS = 100
+PAYLOADS = int(os.environ.get("PAYLOADS", "100"))
 TRUNCATED_EVERY = 10
 
 
@@ -40,6 +42,37 @@ def decode(message, node, data, texts):
     return decoded
 
 
+def contained(message, random_bytes):
+    """A container's bytes, made by hand so that headers of no known PDU, PDUs that come twice or are cut, and padding are among them."""
+    data = b""
+    for _ in range(random_bytes.randrange(5)):
+        inner = random_bytes.choice(message.contained_messages)
+        header_id, length = inner.header_id, inner.length
+        if random_bytes.random() < 0.2:
+            header_id, length = random_bytes.randrange(1, 1 << 24), random_bytes.randrange(9)
+        elif random_bytes.random() < 0.2:
+            length = random_bytes.randrange(inner.length + 1)
+        data += header_id.to_bytes(3, "big") + bytes([length]) + random_bytes.randbytes(length)
+    if random_bytes.random() < 0.2:
+        data = data[: random_bytes.randrange(len(data) + 1)]
+    return data[: message.length]
+
+
+def decode_container(message, data, texts):
+    """The signals of each PDU under `PDU.signal`, of one that comes again those of the last."""
+    values = {}
+    for inner, bytes_of_it in message.unpack_container(data, allow_truncated=True):
+        if isinstance(inner, int):
+            continue
+        of_it = {}
+        decoded = decode(inner, inner._codecs, bytes_of_it, of_it)
+        for known, new in ((values, decoded), (texts, of_it)):
+            for name in [name for name in known if name.startswith(f"{inner.name}.")]:
+                del known[name]
+            known.update({f"{inner.name}.{name}": value for name, value in new.items()})
+    return values
+
+
 def decode_file(path):
     import cantools
 
@@ -56,11 +89,16 @@ def decode_file(path):
             if number % TRUNCATED_EVERY == 0 and length:
                 length = random_bytes.randrange(length)
             data = random_bytes.randbytes(length)
+            if message.is_container:
+                data = contained(message, random_bytes)
             answer = {"message": message.name, "id": message.frame_id, "extended": message.is_extended_frame}
             answer["data"] = data.hex()
             try:
                 texts = {}
-                values = decode(message, message._codecs, data, texts)
+                if message.is_container:
+                    values = decode_container(message, data, texts)
+                else:
+                    values = decode(message, message._codecs, data, texts)
                 answer["texts"] = texts
                 answer["signals"] = {name: text(value) for name, value in values.items()}
             except Exception as error:
@@ -68,22 +106,39 @@ def decode_file(path):
             print(json.dumps(answer))
 
 
-def fetch(directory):
-    directory = pathlib.Path(directory)
-    release = f"cantools-{version('cantools')}"
+# Nothing is installed of these: only their files are wanted.
+OTHERS = {"canmatrix": "1.2", "opendbc": "0.3.1"}
+
+
+def source(directory, name, number):
+    """The folder of a release's source."""
+    release = f"{name}-{number}"
     if not (directory / release).is_dir():
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--no-binary", ":all:"]
-        subprocess.run([*command, f"cantools=={version('cantools')}", "--dest", directory], check=True)
+        subprocess.run([*command, f"{name}=={number}", "--dest", directory], check=True)
         with contextlib.closing(tarfile.open(directory / f"{release}.tar.gz")) as archive:
             archive.extractall(directory, filter="data")
+    return directory / release
+
+
+def fetch_others(directory):
+    for name, number in OTHERS.items():
+        for path in sorted(source(pathlib.Path(directory), name, number).rglob("*")):
+            if path.suffix.lower() in (".dbc", ".kcd", ".sym", ".arxml"):
+                print(path)
+
+
+def fetch(directory):
+    files = source(pathlib.Path(directory), "cantools", version("cantools")) / "tests" / "files"
     for kind in ("dbc", "kcd", "sym", "arxml"):
-        files = (directory / release / "tests" / "files" / kind).iterdir()
-        print("\n".join(sorted(str(path) for path in files if path.suffix.lower() == f".{kind}")))
+        print("\n".join(sorted(str(path) for path in (files / kind).iterdir() if path.suffix.lower() == f".{kind}")))
 
 
 if __name__ == "__main__":
     if sys.argv[1] == "files":
         fetch(sys.argv[2])
+    elif sys.argv[1] == "others":
+        fetch_others(sys.argv[2])
     else:
         for name in sys.argv[2:]:
             decode_file(name)

@@ -301,3 +301,18 @@ fn values_become_frames() {
         assert_eq!(found, expected, "{text}");
     }
 }
+
+/// Found with a file of an old computer: it was a database without messages, which looked like success.
+#[test]
+fn lines_may_end_with_a_carriage_return_alone_and_a_file_that_is_not_understood_is_an_error() {
+    let text = "VERSION \"\"\nBU_: A\nBO_ 256 M: 1 A\n SG_ S : 0|8@1+ (1,0) [0|0] \"\" A\nCM_ BO_ 256 \"two\nlines\";\n";
+    let database = dbc::parse("a.dbc", text.replace('\n', "\r").as_bytes()).unwrap();
+    assert_eq!((database.warnings.len(), database.messages.len()), (0, 1));
+    assert_eq!((database.messages[0].description.as_str(), database.messages[0].line), ("two\nlines", 3));
+    let error = dbc::parse("a.dbc", b"VERSION \"\"\nBU_: A\nEV_ X: 0 [0|1] \"\" 2,5 2 D A;\n")
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("line 3: EV_ X") && error.contains("not understood"), "{error}");
+    // Without anything wrong it may be empty.
+    assert!(dbc::parse("a.dbc", b"VERSION \"\"\nBU_: A\n").unwrap().messages.is_empty());
+}

@@ -9,7 +9,8 @@ use proptest::prelude::*;
 fn message(signals: Vec<Signal>) -> Message {
     let id = Id::standard(5).unwrap();
     let (name, description) = ("M".to_owned(), String::new());
-    Message { id, name, description, length: 8, cycle_ms: None, j1939: false, signals, line: 0 }
+    let (cycle_ms, container) = (None, None);
+    Message { id, name, description, length: 8, cycle_ms, j1939: false, container, signals, line: 0 }
 }
 
 fn decoder(message: Message) -> Decoder {

@@ -1,12 +1,14 @@
 //! How databases match a trace.
 
-use std::collections::HashMap;
+use std::collections::{BTreeMap, HashMap};
 use std::io::Write;
 
+use cantap::TraceRecord;
 use cantap_analysis::stats::{IdStatistics, Options, Statistics};
 use cantap_signals::{Database, Decoder, MessageRef, Source};
 use serde_json::json;
 
+use super::describe::header_id;
 use crate::input::Records;
 use crate::words::counted;
 
@@ -34,6 +36,50 @@ impl Heard {
     }
 }
 
+/// What containers had, by the message and the identifier in the header; those that a database knows are there from the start.
+#[derive(Default)]
+struct Contained(BTreeMap<(MessageRef, u32), u64>);
+
+impl Contained {
+    fn of(decoder: &Decoder) -> Self {
+        let mut counts = BTreeMap::new();
+        for (reference, _, message) in decoder.messages() {
+            let pdus = message.container.iter().flat_map(|container| &container.pdus);
+            counts.extend(pdus.map(|pdu| ((reference, pdu.header_id), 0)));
+        }
+        Self(counts)
+    }
+
+    fn push(&mut self, decoder: &Decoder, record: &TraceRecord) {
+        let Some(frame) = record.frame().filter(|frame| !frame.is_remote() && !self.0.is_empty()) else {
+            return;
+        };
+        let Some(reference) = decoder.find(record.channel, frame.id()) else { return };
+        let Some(container) = &decoder.message(reference).container else { return };
+        for part in container.parts(frame.data()) {
+            // Damage makes ever new identifiers.
+            const MOST: usize = 10_000;
+            if self.0.len() < MOST || self.0.contains_key(&(reference, part.header_id)) {
+                *self.0.entry((reference, part.header_id)).or_default() += 1;
+            }
+        }
+    }
+
+    /// Message, identifier in the header, name if a database has one, and how often it came.
+    fn rows<'a>(
+        &'a self,
+        decoder: &'a Decoder,
+    ) -> impl Iterator<Item = (&'a str, String, Option<&'a str>, u64)> {
+        self.0.iter().filter_map(|(&(reference, id), &count)| {
+            let message = decoder.message(reference);
+            let container = message.container.as_ref()?;
+            let known = container.pdus.iter().find(|pdu| pdu.header_id == id);
+            let name = known.map(|pdu| pdu.name.as_str());
+            Some((message.name.as_str(), header_id(container, id), name, count))
+        })
+    }
+}
+
 /// Compares with a trace and prints.
 pub fn run(
     databases: Vec<Database>,
@@ -48,10 +94,12 @@ pub fn run(
         decoder.assume_j1939();
     }
     let mut statistics = Statistics::new(Options::default())?;
+    let mut contained = Contained::of(&decoder);
     let mut batch = Vec::new();
     while records.next_batch(&mut batch)? {
         for record in &batch {
             statistics.push(record);
+            contained.push(&decoder, record);
         }
     }
     let (mut known, mut unknown) = (Vec::new(), Vec::new());
@@ -97,8 +145,13 @@ pub fn run(
                 object
             })
             .collect();
+        let pdus: Vec<_> = contained
+            .rows(&decoder)
+            .map(|(message, header_id, pdu, count)| json!({ "message": message, "header_id": header_id, "pdu": pdu, "count": count }))
+            .collect();
         let mut object = json!({
             "frames": frames, "covered": covered, "unlisted": unlisted,
+            "contained": pdus,
             "not_in_database": missing, "never_came": silent, "messages": cycles,
         });
         records.missing().put_into(&mut object);
@@ -153,6 +206,13 @@ pub fn run(
             described.name,
             if off(heard, *message) == Some(true) { "  (another cycle than the database says)" } else { "" }
         )?;
+    }
+    if !contained.0.is_empty() {
+        writeln!(out, "\nIn containers:")?;
+    }
+    for (message, header_id, pdu, count) in contained.rows(&decoder) {
+        let pdu = pdu.unwrap_or("(not in the databases)");
+        writeln!(out, "  {message} {header_id:<8} {count:>9}  {pdu}")?;
     }
     Ok(())
 }

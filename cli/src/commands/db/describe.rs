@@ -2,7 +2,9 @@
 
 use std::io::Write;
 
-use cantap_signals::{ByteOrder, Database, Message, Selection, Signal, Suggestion, ValueKind};
+use cantap_signals::{
+    ByteOrder, Container, ContainerHeader, Database, Message, Selection, Signal, Suggestion, ValueKind,
+};
 use serde_json::{Value, json};
 
 use crate::words::counted;
@@ -60,6 +62,24 @@ fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
     }
     writeln!(out, "{}", if message.j1939 { ", J1939" } else { "" })?;
     comment(&message.description, "  ", out)?;
+    if let Some(container) = &message.container {
+        let header = if container.header == ContainerHeader::Long { "long" } else { "short" };
+        writeln!(out, "  from byte {} on a container of PDUs, each behind a {header} header:", container.at)?;
+        for pdu in &container.pdus {
+            write!(
+                out,
+                "    {} {}, {}",
+                header_id(container, pdu.header_id),
+                pdu.name,
+                counted(pdu.length.into(), "byte")
+            )?;
+            if let Some(cycle) = pdu.cycle_ms {
+                write!(out, ", every {cycle} ms")?;
+            }
+            writeln!(out)?;
+            comment(&pdu.description, "      ", out)?;
+        }
+    }
     let pages = message.pages();
     for page in &pages {
         writeln!(out)?;
@@ -68,7 +88,11 @@ fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
                 page.iter().filter_map(|&place| condition(message, &message.signals[place])).collect();
             let mut own: Vec<_> = own.into_iter().collect();
             own.dedup();
-            writeln!(out, "  {}:", own.join(", "))?;
+            let pdu = page.first().and_then(|&place| message.signals[place].contained.as_ref());
+            own.splice(0..0, pdu.map(|pdu| format!("in {}", pdu.name)));
+            if !own.is_empty() {
+                writeln!(out, "  {}:", own.join(", "))?;
+            }
         }
         write!(out, "{}", message.layout_picture(page))?;
     }
@@ -103,6 +127,12 @@ fn show(message: &Message, out: &mut impl Write) -> anyhow::Result<()> {
         }
     }
     Ok(())
+}
+
+/// The identifier in a PDU's header, in as many digits as it has there.
+pub fn header_id(container: &Container, header_id: u32) -> String {
+    let width = if container.header == ContainerHeader::Long { 8 } else { 6 };
+    format!("{header_id:0width$X}")
 }
 
 fn comment(text: &str, indent: &str, out: &mut impl Write) -> anyhow::Result<()> {
@@ -158,6 +188,7 @@ fn as_json(message: &Message) -> Value {
                 signal.values.iter().map(|(value, text)| json!({ "value": value, "text": text })).collect();
             json!({
                 "name": signal.label(),
+                "pdu": signal.contained.as_ref().map(|pdu| &pdu.name),
                 "start": signal.start,
                 "length": signal.length,
                 "order": if signal.order == ByteOrder::Big { "big" } else { "little" },
@@ -173,6 +204,17 @@ fn as_json(message: &Message) -> Value {
             })
         })
         .collect();
+    let pdus = message.container.iter().flat_map(|container| {
+        container.pdus.iter().map(|pdu| {
+            json!({
+                "header_id": header_id(container, pdu.header_id),
+                "name": pdu.name,
+                "length": pdu.length,
+                "cycle_ms": pdu.cycle_ms,
+                "comment": pdu.description,
+            })
+        })
+    });
     json!({
         "id": message.id.to_string(),
         "extended": message.id.is_extended(),
@@ -181,6 +223,7 @@ fn as_json(message: &Message) -> Value {
         "cycle_ms": message.cycle_ms,
         "j1939": message.j1939,
         "comment": message.description,
+        "pdus": pdus.collect::<Vec<_>>(),
         "signals": signals,
     })
 }

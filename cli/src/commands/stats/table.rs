@@ -87,14 +87,22 @@ fn channel_text(channel: &ChannelSummary, summary: &Summary, out: &mut String) {
             percent(load.instant_pct),
             percent(load.instant_max_pct),
         );
-        let _ = writeln!(
-            out,
-            "  windows   {} s: least {}, mean {}, most {}{bound}",
-            summary.window_s,
-            percent(load.window_min_pct),
-            percent(load.window_mean_pct),
-            percent(load.window_max_pct),
-        );
+        if load.window_max_pct.is_none() && load.window_min_pct.is_none() && channel.lost.total == 0 {
+            let _ = writeln!(
+                out,
+                "  windows   {} s: the trace is too short for one; choose shorter ones with --window",
+                summary.window_s
+            );
+        } else {
+            let _ = writeln!(
+                out,
+                "  windows   {} s: least {}, mean {}, most {}{bound}",
+                summary.window_s,
+                percent(load.window_min_pct),
+                percent(load.window_mean_pct),
+                percent(load.window_max_pct),
+            );
+        }
     }
     let errors = &channel.errors;
     if errors.total > 0 {

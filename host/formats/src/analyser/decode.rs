@@ -7,7 +7,7 @@ use super::super::found::Row as ReadRow;
 use super::super::issue::Fault;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
-use super::{COLUMNS, ERRORS};
+use super::{COLUMNS, ERRORS, OVERRUN};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 /// Reads rows of the table.
@@ -85,8 +85,7 @@ impl RowDecoder {
                     if time.is_empty() { shown } else { time },
                 )
             })?;
-        let lost = TraceEvent::Lost { stage: None, count: 1, at_least: true };
-        let second = (cell(20) == b"Y").then_some(lost);
+        let second = (cell(20) == b"Y").then_some(OVERRUN);
         let record =
             |event| TraceRecord { time_ns: self.start_ns.saturating_add(offset_ns), channel: 1, event };
         let kinds = ERRORS.iter().enumerate();

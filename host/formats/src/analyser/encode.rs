@@ -9,7 +9,7 @@ use super::super::left_out::LeftOut;
 use super::super::output::Patch;
 use super::super::text::{self, NS_PER_S};
 use super::super::zone::Zone;
-use super::ERRORS;
+use super::{ERRORS, OVERRUN};
 use cantap_trace::bits::FrameBits;
 use cantap_trace::{Direction, TraceEvent, TraceFrame, TraceRecord};
 
@@ -50,9 +50,6 @@ impl RowEncoder {
     /// Takes a record; returns the row before it.
     pub(crate) fn add(&mut self, record: &TraceRecord, left_out: &mut LeftOut) -> Option<TableRow> {
         let offset_ns = record.time_ns.saturating_sub(self.start(record.time_ns));
-        if record.channel != 1 {
-            left_out.note("channels other than 1, which the analyser's table has no column for");
-        }
         let content = match record.event {
             TraceEvent::Frame { frame: TraceFrame::Fd(_), .. } => {
                 left_out.note("CAN FD frames, which the analyser's table has no row for");
@@ -78,9 +75,12 @@ impl RowEncoder {
                 match &mut self.held {
                     Some(row) if !row.overrun => {
                         row.overrun = true;
-                        left_out.note(
-                            "how many frames were lost: the analyser's table marks only that some were",
-                        );
+                        let is_mark = record.event == OVERRUN && record.channel == 1;
+                        if !is_mark || row.offset_ns != offset_ns {
+                            left_out.note(
+                                "how many frames were lost: the analyser's table marks only that some were",
+                            );
+                        }
                     }
                     _ => left_out.note("losses without a frame of their own before them"),
                 }
@@ -93,6 +93,9 @@ impl RowEncoder {
                 return None;
             }
         };
+        if record.channel != 1 {
+            left_out.note("channels other than 1, which the analyser's table has no column for");
+        }
         self.rows += 1;
         self.held.replace(TableRow { index: self.rows, offset_ns, content, overrun: false })
     }

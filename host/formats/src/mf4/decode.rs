@@ -11,13 +11,14 @@ use super::super::issue::{Fault, Place};
 use super::super::whole::Whole;
 use super::super::zone::Zone;
 use super::blocks::{BLOCK_HEAD_BYTES, Block, u16_at, u32_at, u64_at};
-use super::layout::{Bytes, Content, Events, Group};
+use super::layout::{Alone, Bytes, Content, Events, Group, RecordBytes, Times};
 use super::plain::Plain;
 use super::stream::Stream;
 use super::{FILE_MAGIC, HEADER_AT, UNFINISHED_MAGIC};
 use cantap_trace::{PlainFrame, TraceRecord};
 
 const MEASURED: &str = "groups of measured signals";
+const INVALID: &str = "records that are marked as invalid";
 
 /// Flags for what must be corrected in an unfinished file.
 pub(super) const OPEN_COUNTERS: u16 = 1;
@@ -68,6 +69,8 @@ struct Part {
     groups: Vec<Group>,
     /// For those whose records are plain frames at fixed places.
     plain: Vec<Option<Plain>>,
+    /// Bytes of a record of each group in the stream.
+    record_bytes: Vec<usize>,
     by_id: HashMap<u64, usize>,
     /// Groups whose records are the bytes of another group's records, by address.
     values: HashMap<u64, Values>,
@@ -247,6 +250,7 @@ fn collect(
     let clock_ns = i64::try_from(u64_at(&header.data, 0)).unwrap_or(0);
     let is_local = header.data.get(12).is_some_and(|flags| flags & LOCAL_TIME != 0);
     let start_ns = if is_local { zone.utc_ns(clock_ns) } else { clock_ns };
+    let alone = alone(file, header.link(0));
     let (mut next, mut count) = (header.link(0), 0);
     if next == 0 {
         return Err(Fault::malformed("a group of data", b"none"));
@@ -258,7 +262,7 @@ fn collect(
         if count * BLOCK_HEAD_BYTES > file.len() {
             return Err(Fault::malformed("a list of groups that ends", b"a circle of links"));
         }
-        match Part::open(file, &group, open, start_ns) {
+        match Part::open(file, &group, open, start_ns, &alone) {
             Ok((part, signals)) => {
                 first.extend((0..signals).map(|_| Found::LeftOut(MEASURED)));
                 parts.extend(part);
@@ -270,14 +274,35 @@ fn collect(
     Ok(())
 }
 
+/// Groups of records that are alone in their group of data.
+fn alone(file: &mut Whole, first: u64) -> Alone {
+    let (mut alone, mut next, mut count) = (Alone::new(), first, 0);
+    while next != 0 && count * BLOCK_HEAD_BYTES <= file.len() {
+        // What is wrong with it is said when it is read.
+        let Ok(group) = file.block(next, *b"##DG") else { break };
+        if group.data.first() == Some(&0) {
+            alone.insert(group.link(1), group.link(2));
+        }
+        next = group.link(0);
+        count += 1;
+    }
+    alone
+}
+
 impl Part {
     /// The content of a data group, if it has bus events; and how many of its groups are signals.
-    fn open(file: &mut Whole, block: &Block, open: u16, start_ns: i64) -> Result<(Option<Self>, u32), Fault> {
+    fn open(
+        file: &mut Whole,
+        block: &Block,
+        open: u16,
+        start_ns: i64,
+        alone: &Alone,
+    ) -> Result<(Option<Self>, u32), Fault> {
         let id_bytes = usize::from(block.data.first().copied().unwrap_or(0));
         let open_end = open & OPEN_LENGTH != 0;
         let (mut groups, mut next) = (Vec::new(), block.link(1));
         while next != 0 {
-            let (group, behind) = Group::open(file, next, open_end)?;
+            let (group, behind) = Group::open(file, next, open_end, alone)?;
             groups.push(group);
             next = behind;
             if groups.len() as u64 * BLOCK_HEAD_BYTES > file.len() {
@@ -293,21 +318,25 @@ impl Part {
             return Err(Fault::malformed("records that say of which group they are", found.as_bytes()));
         }
         let by_id = groups.iter().enumerate().map(|(at, group)| (group.record_id, at)).collect();
-        let plain = groups.iter().map(|group| match &group.content {
-            Content::Bus(bus) => Plain::of(bus, group.record_bytes, start_ns),
-            Content::Values | Content::Signals => None,
-        });
-        let plain = plain.collect();
         let values = groups.iter().filter(|group| matches!(group.content, Content::Values));
         let values = values.map(|group| (group.address, Values::default())).collect();
-        let stream = Stream::open(file, block.link(2), open_end)?;
         let is_sorted = groups.len() == 1 && id_bytes == 0;
+        let row = if is_sorted { groups[0].record_bytes } else { RecordBytes::default() };
+        let mut stream = Stream::of_records(file, block.link(2), open_end, row.values, row.invalid)?;
+        let record_bytes = groups.iter().map(|group| group.record_bytes.all()).collect::<Vec<_>>();
+        let record_bytes = if stream.invalid().is_some() { vec![row.values] } else { record_bytes };
+        let plain = groups.iter().zip(&record_bytes).map(|(group, len)| match &group.content {
+            Content::Bus(bus) => Plain::of(bus, *len, start_ns),
+            Content::Values | Content::Signals | Content::Times => None,
+        });
+        let plain = plain.collect();
         let is_counted = open & OPEN_COUNTERS == 0;
         let records = if is_sorted && is_counted { groups[0].records } else { u64::MAX };
         let part = Self {
             start_ns,
             id_bytes,
             counts: vec![0; groups.len()],
+            record_bytes,
             groups,
             plain,
             by_id,
@@ -331,6 +360,8 @@ impl Part {
             Err(fault) => {
                 // It is no longer known where one record ends and the next begins.
                 self.ended = true;
+                // What waits would meet the same fault for ever.
+                self.waiting.clear();
                 Ok(Some(Item::Fault(self.at, own(fault)?)))
             }
         }
@@ -373,16 +404,19 @@ impl Part {
                 }
                 // Nothing is waiting, and the record is complete: by far the most frequent case.
                 Content::Bus(bus) if self.waiting.is_empty() && bus.is_complete() => {
-                    let (len, number) = (self.groups[group].record_bytes, self.counts[group]);
+                    let (len, number) = (self.record_bytes[group], self.counts[group]);
                     let Some(record) = self.stream.at(file, self.at, len)? else {
                         return Ok(Some(self.cut()));
                     };
                     self.at += len as u64;
                     self.counts[group] += 1;
-                    return Ok(Some(Item::of(bus.record(record, number, None, self.start_ns), place)));
+                    return Ok(Some(Item::of(
+                        bus.record(record, record, number, None, self.start_ns),
+                        place,
+                    )));
                 }
-                Content::Signals | Content::Bus(_) => {
-                    let len = self.groups[group].record_bytes;
+                Content::Signals | Content::Times | Content::Bus(_) => {
+                    let len = self.record_bytes[group];
                     let Some(record) = self.stream.at(file, self.at, len)? else {
                         return Ok(Some(self.cut()));
                     };
@@ -430,7 +464,7 @@ impl Part {
             if !is_next(frame.time_ns) {
                 return;
             }
-            self.at += (self.id_bytes + self.groups[group].record_bytes) as u64;
+            self.at += (self.id_bytes + self.record_bytes[group]) as u64;
             self.counts[group] += 1;
             self.time_ns = frame.time_ns;
             frames.push(frame);
@@ -446,7 +480,7 @@ impl Part {
             return Some(Fault::Truncated("a group of frames"));
         }
         // The counter is damaged, or the file's writer reserved more space than it had records.
-        if is_sorted && rest >= self.groups[0].record_bytes.max(1) as u64 {
+        if is_sorted && rest >= self.record_bytes[0].max(1) as u64 {
             let expected = format!("no more data than the {} records that are counted", self.records);
             return Some(Fault::malformed(expected, format!("{rest} bytes more").as_bytes()));
         }
@@ -476,7 +510,7 @@ impl Part {
         }
         if self.id_bytes == 0 {
             // A zero-length record would never end.
-            let len = self.groups[0].record_bytes as u64;
+            let len = self.record_bytes[0] as u64;
             return Ok((len > 0 && self.at + len <= self.stream.len()).then_some(0));
         }
         let Some(id) = self.stream.at(file, self.at, self.id_bytes)? else { return Ok(None) };
@@ -517,7 +551,31 @@ impl Part {
                 }
             }
         };
-        let item = Item::of(bus.record(record, *number, apart.as_deref(), self.start_ns), place);
+        let invalid_bytes = self.groups[*group].record_bytes.invalid;
+        let Content::Bus(bus) = &mut self.groups[*group].content else { return Ok(None) };
+        let bits = match self.stream.invalid() {
+            Some(stream) => {
+                let at = number.saturating_mul(invalid_bytes as u64);
+                stream
+                    .at(file, at, invalid_bytes)?
+                    .ok_or(Fault::Truncated("the bits that say what is valid"))?
+            }
+            None => record.get(record.len().saturating_sub(invalid_bytes)..).unwrap_or_default(),
+        };
+        let item = if bus.is_invalid(bits) {
+            Item::LeftOut(INVALID)
+        } else {
+            let time = match &mut bus.times {
+                None => None,
+                Some(Times { stream, record_bytes }) => {
+                    let at = number.saturating_mul(*record_bytes as u64);
+                    let time = stream.at(file, at, *record_bytes)?;
+                    Some(time.ok_or(Fault::Truncated("the times of a group of frames"))?.to_vec())
+                }
+            };
+            let time = time.as_deref().unwrap_or(record);
+            Item::of(bus.record(record, time, *number, apart.as_deref(), self.start_ns), place)
+        };
         self.waiting.pop_front();
         Ok(Some(item))
     }

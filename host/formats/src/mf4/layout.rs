@@ -1,6 +1,8 @@
 //! What an MF4 file says about its groups: which of them carry bus events, and where each field is in a
 //! record.
 
+use std::collections::HashMap;
+
 use super::super::issue::Fault;
 use super::super::whole::Whole;
 use super::blocks::{Block, u16_at, u32_at, u64_at};
@@ -12,6 +14,13 @@ const MAX_DEPTH: u32 = 8;
 
 /// Group flag: its records have variable length and belong to another group's channel.
 const VARIABLE_LENGTH: u16 = 1;
+/// In a group's flags: the times of its records are the records of another group (4.2).
+const REMOTE_MASTER: u16 = 1 << 3;
+
+/// In a channel's flags: a bit behind the values says whether its own is one.
+const MAY_BE_INVALID: u32 = 1 << 1;
+/// In a channel's flags: none of its values is one.
+const ALL_INVALID: u32 = 1;
 
 // Types of channels.
 const VARIABLE: u8 = 1;
@@ -217,10 +226,44 @@ pub(super) enum Bytes {
     Group { place: Field, address: u64 },
 }
 
+/// Which group a group of data consists of, by its address, where it is the only one: its data, from which its records can be read by number.
+pub(super) type Alone = HashMap<u64, u64>;
+
+/// The records of another group, of which each has the time of one here.
+pub(super) struct Times {
+    pub stream: Stream,
+    pub record_bytes: usize,
+}
+
+/// The bytes of a record: its values, then a bit for each that may be none.
+#[derive(Clone, Copy, Default)]
+pub(super) struct RecordBytes {
+    pub values: usize,
+    pub invalid: usize,
+}
+
+impl RecordBytes {
+    fn of(group: &Block) -> Self {
+        // Behind the links there is one more in a group with times elsewhere, but the fields are the same.
+        Self { values: u32_at(&group.data, 24) as usize, invalid: u32_at(&group.data, 28) as usize }
+    }
+
+    /// All of them.
+    pub(super) fn all(self) -> usize {
+        self.values.saturating_add(self.invalid)
+    }
+}
+
 /// A group whose records are events of a bus.
 pub(super) struct BusGroup {
     pub events: Events,
     pub clock: Clock,
+    /// Where the clock's field is, if it is not in the record.
+    pub times: Option<Times>,
+    /// Bits that say that what a record cannot do without is no value.
+    pub invalid_bits: Vec<u32>,
+    /// Whether none of its records is valid.
+    pub all_invalid: bool,
     /// The channel named by the group's source, if its records do not name one.
     pub bus: u8,
     pub bus_channel: Option<Field>,
@@ -244,6 +287,8 @@ pub(super) enum Content {
     Values,
     /// Measured signals, and anything else that is not a bus event.
     Signals,
+    /// Nothing but times, for other groups.
+    Times,
 }
 
 /// A group of channels: records of one kind.
@@ -251,7 +296,7 @@ pub(super) struct Group {
     pub address: u64,
     pub record_id: u64,
     pub records: u64,
-    pub record_bytes: usize,
+    pub record_bytes: RecordBytes,
     pub content: Content,
 }
 
@@ -302,13 +347,14 @@ fn channels(
     Ok(())
 }
 
+fn is_master(channel: &Channel) -> bool {
+    matches!(channel.block.data.first(), Some(&(MASTER | VIRTUAL_MASTER)))
+        && matches!(channel.block.data.get(1), Some(&(TIME | 0)))
+}
+
 /// The clock of a group, from its time channel.
 fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault> {
-    let is_master = |channel: &&Channel| {
-        matches!(channel.block.data.first(), Some(&(MASTER | VIRTUAL_MASTER)))
-            && matches!(channel.block.data.get(1), Some(&(TIME | 0)))
-    };
-    let Some(master) = channels.iter().find(is_master) else { return Ok(None) };
+    let Some(master) = channels.iter().find(|channel| is_master(channel)) else { return Ok(None) };
     let is_virtual = master.block.data.first() == Some(&VIRTUAL_MASTER);
     let field = (!is_virtual).then(|| Field::of(&master.block));
     let (mut offset_s, mut factor_s) = (0.0, 1.0);
@@ -328,6 +374,20 @@ fn clock(file: &mut Whole, channels: &[Channel]) -> Result<Option<Clock>, Fault>
     Ok(Some(Clock::new(field, offset_s, factor_s)))
 }
 
+/// The clock that is another group's, and that group's records.
+fn elsewhere(file: &mut Whole, address: u64, open_end: bool, alone: &Alone) -> Result<(Clock, Times), Fault> {
+    let what = || Fault::Unsupported("a group of frames whose times cannot be found".to_owned().into());
+    let data = alone.get(&address).ok_or_else(what)?;
+    let group = file.block(address, *b"##CG")?;
+    let mut all = Vec::new();
+    channels(file, group.link(1), "", 0, &mut all)?;
+    let clock = clock(file, &all)?.ok_or_else(what)?;
+    let bytes = RecordBytes::of(&group);
+    let mut stream = Stream::of_records(file, *data, open_end, bytes.values, bytes.invalid)?;
+    let record_bytes = if stream.invalid().is_some() { bytes.values } else { bytes.all() };
+    Ok((clock, Times { stream, record_bytes }))
+}
+
 /// The number at the end of a name: 2 for `CAN2`, 1 if there is none.
 fn number_of(name: &str) -> u8 {
     let digits = name.len() - name.trim_end_matches(|c: char| c.is_ascii_digit()).len();
@@ -336,15 +396,23 @@ fn number_of(name: &str) -> u8 {
 
 impl Group {
     /// The group at a link, and the link to the next.
-    pub(super) fn open(file: &mut Whole, address: u64, open_end: bool) -> Result<(Self, u64), Fault> {
+    pub(super) fn open(
+        file: &mut Whole,
+        address: u64,
+        open_end: bool,
+        alone: &Alone,
+    ) -> Result<(Self, u64), Fault> {
         let block = file.block(address, *b"##CG")?;
         let (record_id, records) = (u64_at(&block.data, 0), u64_at(&block.data, 8));
-        let record_bytes = u32_at(&block.data, 24) as usize + u32_at(&block.data, 28) as usize;
+        let record_bytes = RecordBytes::of(&block);
         let content = if u16_at(&block.data, 16) & VARIABLE_LENGTH != 0 {
             Content::Values
         } else {
-            match BusGroup::open(file, &block, open_end)? {
+            let mut all = Vec::new();
+            channels(file, block.link(1), "", 0, &mut all)?;
+            match BusGroup::open(file, &block, &all, open_end, alone)? {
                 Some(bus) => Content::Bus(Box::new(bus)),
+                None if all.len() == 1 && is_master(&all[0]) => Content::Times,
                 None => Content::Signals,
             }
         };
@@ -353,14 +421,24 @@ impl Group {
 }
 
 impl BusGroup {
-    fn open(file: &mut Whole, group: &Block, open_end: bool) -> Result<Option<Self>, Fault> {
-        let mut all = Vec::new();
-        channels(file, group.link(1), "", 0, &mut all)?;
+    fn open(
+        file: &mut Whole,
+        group: &Block,
+        all: &[Channel],
+        open_end: bool,
+        alone: &Alone,
+    ) -> Result<Option<Self>, Fault> {
         let begins = |prefix: &str| all.iter().any(|channel| channel.name.starts_with(prefix));
-        let Some((_, events)) = FRAMES.iter().find(|(prefix, _)| begins(prefix)) else { return Ok(None) };
-        let Some(clock) = clock(file, &all)? else {
-            let what = "a group of frames without times (MDF 4.2 can keep them in another group, as columns)";
-            return Err(Fault::Unsupported(what.to_owned().into()));
+        let Some((prefix, events)) = FRAMES.iter().find(|(prefix, _)| begins(prefix)) else {
+            return Ok(None);
+        };
+        let (clock, times) = match clock(file, all)? {
+            Some(clock) => (clock, None),
+            None if u16_at(&group.data, 16) & REMOTE_MASTER != 0 => {
+                let (clock, times) = elsewhere(file, group.link(6), open_end, alone)?;
+                (clock, Some(times))
+            }
+            None => return Err(Fault::Unsupported("a group of frames without times".to_owned().into())),
         };
         let find = |suffix: &str| {
             let is_it = |channel: &&Channel| {
@@ -388,9 +466,20 @@ impl BusGroup {
             let source = file.block(group.link(3), *b"##SI")?;
             bus = number_of(&file.text(source.link(0))?);
         }
+        // Without these it is no frame. What else is no value is read as it stands.
+        let needed = ["ID", "DLC", "DataLength", "DataBytes"];
+        let flags = all.iter().filter(|channel| {
+            channel.name == *prefix || needed.iter().any(|part| channel.name == format!("{prefix}.{part}"))
+        });
+        let flags: Vec<_> =
+            flags.map(|channel| (u32_at(&channel.block.data, 12), u32_at(&channel.block.data, 16))).collect();
+        let invalid_bits = flags.iter().filter(|(flags, _)| flags & MAY_BE_INVALID != 0);
         Ok(Some(Self {
             events: *events,
             clock,
+            times,
+            invalid_bits: invalid_bits.map(|(_, bit)| *bit).collect(),
+            all_invalid: flags.iter().any(|(flags, _)| flags & ALL_INVALID != 0),
             bus,
             bus_channel: field("BusChannel"),
             id: field("ID"),

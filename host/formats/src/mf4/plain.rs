@@ -49,7 +49,7 @@ impl Plain {
             record_bytes,
             reach: record_bytes + Place::BYTES,
         };
-        (bus.events == Events::Frames).then_some(plain)
+        (bus.events == Events::Frames && bus.is_complete()).then_some(plain)
     }
 
     /// The frame in a record that `bytes` begin with; `None` if there is more to say about it, or if not enough follows it.

@@ -8,20 +8,31 @@ use super::layout::{BusGroup, Bytes, Events, Field};
 use cantap_trace::{Direction, TraceEvent, TraceRecord};
 
 impl BusGroup {
-    /// Whether its records contain the bytes of their frames.
+    /// Whether its records alone say everything about their frames.
     pub(super) fn is_complete(&self) -> bool {
-        matches!(self.bytes, None | Some(Bytes::Here(_))) && !matches!(self.events, Events::Other(_))
+        matches!(self.bytes, None | Some(Bytes::Here(_)))
+            && !matches!(self.events, Events::Other(_))
+            && self.times.is_none()
+            && self.invalid_bits.is_empty()
+            && !self.all_invalid
     }
 
-    /// The content of a record. `apart`: its frame's bytes, if they are stored elsewhere.
+    /// Whether one of the bits after a record's values marks it as invalid.
+    pub(super) fn is_invalid(&self, bits: &[u8]) -> bool {
+        let is_set = |bit: &u32| bits.get(*bit as usize / 8).is_some_and(|byte| byte >> (bit % 8) & 1 == 1);
+        self.all_invalid || self.invalid_bits.iter().any(is_set)
+    }
+
+    /// The content of a record. `time`: the record with its time, which may be itself. `apart`: its frame's bytes, if they are stored elsewhere.
     pub(super) fn record(
         &self,
         record: &[u8],
+        time: &[u8],
         number: u64,
         apart: Option<&[u8]>,
         start_ns: i64,
     ) -> Result<TraceRecord, Fault> {
-        let offset_ns = self.clock.ns(record, number);
+        let offset_ns = self.clock.ns(time, number);
         let offset_ns = offset_ns.ok_or_else(|| Fault::malformed("a time within 292 years", b"another"))?;
         let time_ns = start_ns.saturating_add(offset_ns);
         let channel = match &self.bus_channel {

@@ -4,7 +4,7 @@ use std::io::Read;
 
 use super::super::issue::Fault;
 use super::super::whole::Whole;
-use super::blocks::{BLOCK_HEAD_BYTES, u32_at, u64_at};
+use super::blocks::{BLOCK_HEAD_BYTES, Block, u32_at, u64_at};
 
 /// Plain data is read in pieces of this many bytes: they stay in the processor's cache until they have been gone through.
 const PIECE_BYTES: u64 = 1 << 18;
@@ -15,6 +15,9 @@ const MAX_UNPACKED_BYTES: u64 = 256 << 20;
 
 /// Flag of a 4.2 list.
 const INVALID_APART: u32 = 1 << 31;
+
+/// In place of a place in the file: zeros, which are not there.
+const ALL_VALID: u64 = 0;
 
 /// How deeply lists of lists may be nested.
 const MAX_DEPTH: u32 = 4;
@@ -51,6 +54,10 @@ pub(super) struct Stream {
     len: u64,
     /// Whether bytes are missing at the end of the file.
     cut: bool,
+    /// Bytes of a record's values, and of the bits that say which of them are none.
+    row_bytes: (u64, u64),
+    /// These bits, where they lie apart (4.2).
+    invalid: Option<Box<Stream>>,
     /// What was read last, and its position in the stream.
     buffer: Vec<u8>,
     buffer_start: u64,
@@ -64,6 +71,26 @@ impl Stream {
             stream.collect(file, link, open_end, 0)?;
         }
         Ok(stream)
+    }
+
+    /// As [`Self::open`], the data of a group of records: bits that say which values are none may lie apart.
+    pub(super) fn of_records(
+        file: &mut Whole,
+        link: u64,
+        open_end: bool,
+        value_bytes: usize,
+        invalid_bytes: usize,
+    ) -> Result<Self, Fault> {
+        let mut stream = Self { row_bytes: (value_bytes as u64, invalid_bytes as u64), ..Self::default() };
+        if link != 0 {
+            stream.collect(file, link, open_end, 0)?;
+        }
+        Ok(stream)
+    }
+
+    /// The bits that say which values are none, where they lie apart.
+    pub(super) fn invalid(&mut self) -> Option<&mut Self> {
+        self.invalid.as_deref_mut()
     }
 
     /// Length in bytes.
@@ -86,7 +113,7 @@ impl Stream {
     fn collect(&mut self, file: &mut Whole, link: u64, open_end: bool, depth: u32) -> Result<(), Fault> {
         let head = file.head(link)?;
         match &head.name {
-            b"##DT" | b"##SD" | b"##RD" | b"##DV" => {
+            b"##DT" | b"##SD" | b"##RD" | b"##DV" | b"##DI" => {
                 let begin = link + BLOCK_HEAD_BYTES;
                 let there = file.len().saturating_sub(begin);
                 let says = head.len - BLOCK_HEAD_BYTES;
@@ -122,11 +149,11 @@ impl Stream {
                 while next != 0 {
                     let list = file.block(next, head.name)?;
                     if &head.name == b"##LD" && u32_at(&list.data, 0) & INVALID_APART != 0 {
-                        let what = "data in columns, which says apart from its values which of them are valid (MDF 4.2),";
-                        return Err(Fault::Unsupported(what.to_owned().into()));
-                    }
-                    for data in list.links.iter().skip(1).filter(|link| **link != 0) {
-                        self.collect(file, *data, open_end, depth + 1)?;
+                        self.collect_apart(file, &list, open_end, depth + 1)?;
+                    } else {
+                        for data in list.links.iter().skip(1).filter(|link| **link != 0) {
+                            self.collect(file, *data, open_end, depth + 1)?;
+                        }
                     }
                     next = list.link(0);
                     lists += 1;
@@ -138,6 +165,37 @@ impl Stream {
             name => {
                 let name = String::from_utf8_lossy(name).into_owned();
                 return Err(Fault::malformed(format!("a block of data at {link:#x}"), name.as_bytes()));
+            }
+        }
+        Ok(())
+    }
+
+    /// A list of values, and behind them of the bits that say which of these are none; no link to bits says that all are values.
+    fn collect_apart(
+        &mut self,
+        file: &mut Whole,
+        list: &Block,
+        open_end: bool,
+        depth: u32,
+    ) -> Result<(), Fault> {
+        let count = u32_at(&list.data, 4) as usize;
+        let (values, invalid) =
+            list.links.get(1..).and_then(|links| links.split_at_checked(count)).ok_or_else(|| {
+                Fault::malformed(
+                    format!("a list of {count} blocks of data"),
+                    list.links.len().to_string().as_bytes(),
+                )
+            })?;
+        for (at, link) in values.iter().enumerate() {
+            let before = self.len;
+            if *link != 0 {
+                self.collect(file, *link, open_end, depth)?;
+            }
+            let rows = (self.len - before).checked_div(self.row_bytes.0).unwrap_or(0);
+            let bits = self.invalid.get_or_insert_default();
+            match invalid.get(at) {
+                Some(&link) if link != 0 => bits.collect(file, link, open_end, depth)?,
+                _ => bits.push(rows * self.row_bytes.1, ALL_VALID, None),
             }
         }
         Ok(())
@@ -187,7 +245,11 @@ impl Stream {
             } else {
                 let within = loaded - piece.start;
                 let len = (piece.len - within).min(PIECE_BYTES);
-                file.append_at(piece.at + within, len as usize, &mut self.buffer)?;
+                if piece.at == ALL_VALID {
+                    self.buffer.resize(self.buffer.len() + len as usize, 0);
+                } else {
+                    file.append_at(piece.at + within, len as usize, &mut self.buffer)?;
+                }
             }
         }
     }

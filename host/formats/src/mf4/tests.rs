@@ -142,35 +142,125 @@ fn bytes_in_a_stream_of_their_own_and_data_in_lists_plain_and_compressed_are_rea
 
 /// As asammdf writes groups in version 4.2 on request: lists with another name, containing blocks of values.
 #[test]
-fn the_lists_of_4_2_are_read_and_values_that_are_marked_apart_are_named() {
-    for flags in [0_u32, 1 << 31] {
+fn the_lists_of_4_2_are_read_and_the_bits_that_lie_apart_say_what_is_valid() {
+    for apart in [false, true] {
         let (mut blocks, group, bytes) = begin();
-        let (mut data, mut values) = (Vec::new(), Vec::new());
+        let (mut data, mut values, mut bits) = (Vec::new(), Vec::new(), Vec::new());
         for (at, (id, value)) in records().into_iter().enumerate() {
             data.extend(record(at, id, value.len(), values.len() as u64));
+            values.extend((value.len() as u32).to_le_bytes());
+            values.extend(value);
+            bits.push(if at % 10 == 0 { 2 } else { 1 });
+        }
+        let values = blocks.push(*b"##SD", &[], &values);
+        blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
+        // Blocks need not end with a record, but where bits lie apart each has those of its own.
+        let (first, rest) = data.split_at(50 * RECORD_BYTES);
+        let (second, third) = rest.split_at(25 * RECORD_BYTES);
+        let first = packed(&mut blocks, *b"DV", first, RECORD_BYTES);
+        let second = blocks.push(*b"##DV", &[], second);
+        let third = blocks.push(*b"##DV", &[], third);
+        let flags = if apart { 1_u32 << 31 } else { 0 };
+        let fields = |count: u32| [flags.to_le_bytes(), count.to_le_bytes()].concat();
+        let list = if apart {
+            // Of two bits the second one counts.
+            patch(&mut blocks, group, 24 + 6 * 8 + 28, 1);
+            for at in channels_of(&blocks) {
+                patch(&mut blocks, at, 24 + 8 * 8 + 12, 2);
+                patch(&mut blocks, at, 24 + 8 * 8 + 16, 1);
+            }
+            let of_first = packed(&mut blocks, *b"DI", &bits[..50], 0);
+            let of_third = blocks.push(*b"##DI", &[], &bits[75..]);
+            let end = blocks.push(*b"##LD", &[0, third, of_third], &fields(1));
+            // No bits: all of the second block is valid.
+            blocks.push(*b"##LD", &[end, first, second, of_first, 0], &fields(2))
+        } else {
+            let end = blocks.push(*b"##LD", &[0, third], &fields(1));
+            blocks.push(*b"##LD", &[end, first, second], &fields(2))
+        };
+        let file = finish(blocks, group, list, 0, 0);
+        let valid = |at: usize| !apart || !at.is_multiple_of(10) || (50..75).contains(&at);
+        let expected: Vec<_> = log()
+            .lines()
+            .enumerate()
+            .filter(|(at, _)| valid(*at))
+            .map(|(_, line)| format!("{line}\n"))
+            .collect();
+        assert_eq!(as_log(&file), (expected.concat(), Vec::new()), "{apart}");
+        let source = std::io::Cursor::new(file);
+        let mut reader =
+            TraceReader::from_source("a.mf4", source, Format::Mf4, &ReadOptions::default()).unwrap();
+        assert_eq!(reader.by_ref().count(), expected.len());
+        let left_out: Vec<_> = reader.left_out().iter().collect();
+        assert_eq!(left_out, if apart { vec![("records that are marked as invalid", 7)] } else { vec![] });
+    }
+}
+
+/// Writes a number into a block.
+fn patch(blocks: &mut Blocks, block: u64, at: usize, value: u32) {
+    blocks.0[block as usize + at..][..4].copy_from_slice(&value.to_le_bytes());
+}
+
+/// The addresses of all channels so far.
+fn channels_of(blocks: &Blocks) -> Vec<u64> {
+    memchr::memmem::find_iter(&blocks.0, b"##CN").map(|at| at as u64).collect()
+}
+
+/// Times in the records of another group, as MDF 4.2 has them in columns.
+#[test]
+fn the_times_of_frames_may_be_the_records_of_another_group() {
+    const REMOTE_MASTER: u16 = 8;
+    for (remote, cut) in [(true, 0), (true, 8), (false, 0)] {
+        let (mut blocks, old, bytes) = begin();
+        let mut values = Vec::new();
+        let (mut times, mut data) = (Vec::new(), Vec::new());
+        for (at, (id, value)) in records().into_iter().enumerate() {
+            let record = record(at, id, value.len(), values.len() as u64);
+            times.extend(&record[..8]);
+            data.extend([&[0; 8], &record[8..]].concat());
             values.extend((value.len() as u32).to_le_bytes());
             values.extend(value);
         }
         let values = blocks.push(*b"##SD", &[], &values);
         blocks.0[bytes + LINK_TO_DATA..][..8].copy_from_slice(&values.to_le_bytes());
-        let (first, rest) = data.split_at(1000);
-        let (second, third) = rest.split_at(500);
-        let first = packed(&mut blocks, *b"DV", first, RECORD_BYTES);
-        let second = blocks.push(*b"##DV", &[], second);
-        let third = blocks.push(*b"##DV", &[], third);
-        let fields = [&flags.to_le_bytes()[..], &[0; 4]].concat();
-        let end = blocks.push(*b"##LD", &[0, third], &fields);
-        let list = blocks.push(*b"##LD", &[end, first, second], &fields);
-        let (read, issues) = as_log(&finish(blocks, group, list, 0, 0));
-        if flags == 0 {
-            assert_eq!((read, issues), (log(), Vec::new()));
-        } else {
-            assert!(
-                read.is_empty() && issues.len() == 1 && issues[0].contains("valid (MDF 4.2)"),
-                "{issues:?}"
-            );
+        // The group of frames begins with the channel behind that of times.
+        let (time, source) = (link(&blocks, old, 1), link(&blocks, old, 3));
+        let frame = link(&blocks, time, 0);
+        blocks.0[time as usize + 24..][..8].copy_from_slice(&0_u64.to_le_bytes());
+        let master = group(&mut blocks, 0, 0, 8, [0, time, source]);
+        let flags = if remote { REMOTE_MASTER } else { 0 };
+        let of_frames = group(&mut blocks, 0, flags, RECORD_BYTES as u32, [0, frame, source]);
+        let at = of_frames as usize;
+        // One link more: to the group of times.
+        let mut with_master = blocks.0[at..].to_vec();
+        with_master[8..16].copy_from_slice(&(24 + 7 * 8 + 32_u64).to_le_bytes());
+        with_master[16..24].copy_from_slice(&7_u64.to_le_bytes());
+        with_master.splice(24 + 6 * 8..24 + 6 * 8, master.to_le_bytes());
+        blocks.0.splice(at.., with_master);
+        let times = blocks.push(*b"##DT", &[], &times[..times.len() - cut]);
+        let data = packed(&mut blocks, *b"DT", &data, RECORD_BYTES);
+        let second = blocks.push(*b"##DG", &[0, of_frames, data, 0], &[0; 8]);
+        let mut file = finish(blocks, master, times, 0, 0);
+        // The group of data of the times, the last block, goes on with that of the frames.
+        let first = memchr::memmem::rfind(&file, b"##DG").unwrap();
+        file[first + 24..][..8].copy_from_slice(&second.to_le_bytes());
+        let (read, issues) = as_log(&file);
+        match (remote, cut) {
+            (false, _) => assert!(issues[0].contains("a group of frames without times"), "{issues:?}"),
+            (true, 0) => assert_eq!((read, issues), (log(), Vec::new())),
+            _ => {
+                assert_eq!(read.lines().count(), 99);
+                assert!(
+                    issues.len() == 1 && issues[0].contains("the times of a group of frames"),
+                    "{issues:?}"
+                );
+            }
         }
     }
+}
+
+fn link(blocks: &Blocks, block: u64, at: usize) -> u64 {
+    u64::from_le_bytes(*blocks.0[block as usize + 24 + 8 * at..].first_chunk().unwrap())
 }
 
 /// Found with asammdf's files: a measurement gave an empty trace, which looked like success.

@@ -172,6 +172,10 @@ impl Encoder {
             let at = out.len();
             text::push_decimal(out, u64::from(channel));
             text::pad_right(out, at, 3);
+            // PEAK's buses have up to two digits, Vector's and ours three.
+            if channel >= 100 {
+                out.push(b' ');
+            }
         }
     }
 

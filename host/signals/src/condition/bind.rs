@@ -126,11 +126,13 @@ impl Binder<'_> {
         }
         let decoder = self.decoder;
         let named = |(message, index, signal): (MessageRef, usize, &Signal)| {
-            let same = match name.split_once('.') {
-                Some((of, name)) => decoder.message(message).name == of && signal.name == name,
-                None => signal.name == name,
+            // Names of messages and of signals may have dots in them.
+            let mut dots = name.match_indices('.');
+            let is_named = |(at, _): (usize, &str)| {
+                signal.name == name[at + 1..] && signal.is_in(&name[..at], decoder.message(message))
             };
-            same.then_some((message, index as u32))
+            (if name.contains('.') { dots.any(is_named) } else { signal.name == name })
+                .then_some((message, index as u32))
         };
         let candidates: Vec<_> = decoder.signals().filter_map(named).collect();
         if candidates.is_empty() {

@@ -40,6 +40,11 @@ pub enum EncodeError {
         /// A similar name.
         near: Suggestion,
     },
+    /// The message is a container, of which no frame can be made.
+    #[error(
+        "message {0} is a container of other PDUs, which cannot be sent by name; send its bytes, as in 123##0112233"
+    )]
+    Container(String),
     /// The signal is given twice.
     #[error("signal {0} is given twice")]
     Twice(String),

@@ -55,9 +55,12 @@ impl MessageRows {
         self.words.is_empty()
     }
 
-    /// Adds a frame's data. Returns false and adds nothing if it has more than eight bytes: use [`Self::one`] for those.
+    /// Adds a frame's data. Returns false and adds nothing if it has more than eight bytes or contains PDUs: use [`Self::one`] for those.
     #[inline]
     pub fn push(&mut self, data: &[u8]) -> bool {
+        if self.message.container.is_some() {
+            return false;
+        }
         let mut padded = [0; 8];
         let Some(bytes) = padded.get_mut(..data.len()) else { return false };
         bytes.copy_from_slice(data);

@@ -248,6 +248,7 @@ mod tests {
             length: 4,
             cycle_ms: None,
             j1939: false,
+            container: None,
             signals: vec![
                 signal("Oil", 0, "°C"),
                 signal("Water", 8, "°C"),

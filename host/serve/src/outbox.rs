@@ -2,11 +2,12 @@
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use cantap_wire::message::EndReason;
 use cantap_wire::{CHANNELS, Channel};
 
+use crate::flow::Flow;
 use crate::stream::{ClientId, Counts, Entry, Gap, View, Views, count, shown};
 
 /// Records that wait for a client at most: six seconds of two saturated channels, in at most 15 MB, which all clients share as far as they
@@ -16,6 +17,11 @@ pub const MOST_RECORDS: usize = 1 << 18;
 const MOST_ANSWERS: usize = 64;
 /// Taken to be written at a time.
 const TAKEN_RECORDS: usize = 4096;
+/// Bytes that a record takes at most, most of the time.
+const RECORD_BYTES: u64 = 16;
+/// Whoever closes a channel is given what waits for him for so long. A line that carries the buses needs milliseconds; one that does not would
+/// have him wait for as long as it is behind.
+const REST_TIMEOUT: Duration = Duration::from_secs(2);
 
 /// One thing to tell the client.
 pub enum Item {
@@ -23,8 +29,8 @@ pub enum Item {
     Restart(Vec<u8>, u64),
     /// A channel is the client's from here on.
     Attach(Channel, View, u64),
-    /// Nothing of the channel follows.
-    Detach(Channel, u64),
+    /// Nothing of the channel follows, and from the moment on what waits before it is not sent any more.
+    Detach(Channel, u64, Instant),
     /// Records.
     Chunk(Arc<[Entry]>),
     /// Records that there was no room for.
@@ -38,6 +44,8 @@ pub enum Item {
 pub struct Work {
     /// Encoded.
     pub answers: Vec<Vec<u8>>,
+    /// Too late to be sent: a channel was closed behind it.
+    pub given_up: Vec<Item>,
     pub items: Vec<Item>,
     /// Nothing follows.
     pub is_last: bool,
@@ -50,6 +58,9 @@ struct Queue {
     /// Records in the items.
     records: usize,
     gap: Option<Gap>,
+    flow: Flow,
+    /// Sent frames of others among what was given up, which count as frames only then.
+    given_up: [u32; CHANNELS],
     /// Nothing more is put in.
     is_closed: bool,
     /// Nobody takes anything out any more.
@@ -114,12 +125,47 @@ impl Outbox {
         self.changed.notify_all();
     }
 
+    /// Nothing of a channel follows. What waits is sent for [`REST_TIMEOUT`]; then the rest of it is the client's loss.
+    pub fn detach(&self, channel: Channel, ticks: u64) {
+        self.push(Item::Detach(channel, ticks, Instant::now() + REST_TIMEOUT));
+    }
+
+    /// The client has read so many bytes.
+    pub fn acknowledge(&self, read: u64) {
+        self.lock().flow.acknowledge(read, Instant::now());
+        self.changed.notify_all();
+    }
+
+    /// So many bytes were written.
+    pub fn wrote(&self, len: usize) {
+        self.lock().flow.wrote(len, Instant::now());
+    }
+
+    /// Whether there is something to write that has to wait until the client has read more.
+    pub fn is_held_up(&self) -> bool {
+        let queue = self.lock();
+        !queue.may_take_items() && !queue.items.is_empty()
+    }
+
+    /// Frames of each channel that were given up, beyond those counted when they were put in.
+    pub fn give_up(&self, frames: [u32; CHANNELS]) {
+        for (sum, frames) in self.lock().given_up.iter_mut().zip(frames) {
+            *sum = sum.wrapping_add(frames);
+        }
+    }
+
+    /// Their sum in this session.
+    pub fn given_up(&self) -> [u32; CHANNELS] {
+        self.lock().given_up
+    }
+
     /// Begins a session: what waits belongs to none.
     pub fn restart(&self, answer: Vec<u8>, ticks: u64) {
         let mut queue = self.lock();
         let is_closed = queue.is_closed;
         let is_abandoned = queue.is_abandoned;
-        *queue = Queue { is_closed, is_abandoned, ..Queue::default() };
+        let flow = std::mem::take(&mut queue.flow);
+        *queue = Queue { is_closed, is_abandoned, flow, ..Queue::default() };
         queue.items.push_back(Item::Restart(answer, ticks));
         drop(queue);
         self.changed.notify_all();
@@ -140,22 +186,28 @@ impl Outbox {
     /// What there is to write next, waited for at most `timeout`.
     pub fn take(&self, timeout: Duration) -> Work {
         let idle = |queue: &mut Queue| {
-            queue.answers.is_empty() && queue.items.is_empty() && queue.gap.is_none() && !queue.is_closed
+            let nothing = queue.items.is_empty() && queue.gap.is_none() && !queue.is_closed;
+            queue.answers.is_empty() && (nothing || !queue.may_take_items())
         };
         let waited = self.changed.wait_timeout_while(self.lock(), timeout, idle);
         let mut queue = waited.unwrap_or_else(PoisonError::into_inner).0;
         let mut work = Work { answers: queue.answers.drain(..).collect(), ..Work::default() };
         let mut taken = 0;
-        while taken < TAKEN_RECORDS
+        for _ in 0..queue.overdue(Instant::now()) {
+            let Some(item) = queue.items.pop_front() else { break };
+            taken += item.records();
+            work.given_up.push(item);
+        }
+        let most = taken + (queue.flow.room() / RECORD_BYTES).min(TAKEN_RECORDS as u64) as usize;
+        while taken < most
+            && queue.may_take_items()
             && let Some(item) = queue.items.pop_front()
         {
-            if let Item::Chunk(chunk) = &item {
-                taken += chunk.len();
-            }
+            taken += item.records();
             work.items.push(item);
         }
         queue.records -= taken;
-        if queue.items.is_empty() {
+        if queue.items.is_empty() && queue.may_take_items() {
             work.items.extend(queue.gap.take().map(Item::Gap));
             work.is_last = queue.is_closed;
         }
@@ -184,7 +236,25 @@ impl Outbox {
     }
 }
 
+impl Item {
+    /// Records that it takes room for.
+    fn records(&self) -> usize {
+        if let Self::Chunk(chunk) = self { chunk.len() } else { 0 }
+    }
+}
+
 impl Queue {
+    /// Whether what waits may go on its way. At the end nobody says any more what has arrived.
+    fn may_take_items(&self) -> bool {
+        self.is_closed || self.flow.room() >= RECORD_BYTES
+    }
+
+    /// How many items stand up to the last channel that was closed too long ago.
+    fn overdue(&self, now: Instant) -> usize {
+        let is_late = |item: &Item| matches!(item, Item::Detach(_, _, until) if *until <= now);
+        self.items.iter().rposition(is_late).map_or(0, |at| at + 1)
+    }
+
     fn push(&mut self, item: Item) {
         if self.is_closed {
             return;

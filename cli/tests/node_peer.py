@@ -1,4 +1,4 @@
-"""Other people's nodes on a board that `cantap serve` shares, for nodes.rs: they join by socketcand.
+"""Nodes of other programs on a board shared by `cantap serve`, for nodes.rs: they connect through socketcand.
 
 uds, canopen, j1939 HOST PORT     serves until standard input ends; prints "ready" when it does
 """
@@ -130,7 +130,7 @@ DefaultValue=7
 
 
 def serve_canopen(host, port):
-    """Node 5 on python-canopen. Its library is no LSS slave: the one that has no number yet is written here, by CiA 305."""
+    """Node 5 on python-canopen. Its library has no LSS slave: the node without a number is implemented here, according to CiA 305."""
     import io
 
     import canopen
@@ -174,7 +174,7 @@ def serve_canopen(host, port):
 
 
 def serve_j1939(host, port):
-    """Node 129 on can-j1939: answers requests for two groups, one of them in many frames, and repeats what it is sent."""
+    """Node 129 on can-j1939: answers requests for two groups, one of them in many frames, and repeats what is sent to it."""
     import j1939
 
     ecu = j1939.ElectronicControlUnit()

@@ -1,5 +1,5 @@
-//! The properties of the fuzz targets, with random bytes: nothing panics, every event can be written, and memory is flat under a flood
-//! of messages that are never finished.
+//! The properties checked by the fuzz targets, with random bytes: nothing panics, every event can be written, and memory stays flat
+//! under a flood of messages that are never finished.
 
 use cantap_protocols::canopen::Sheet;
 use cantap_protocols::canopen::eds::Eds;
@@ -20,7 +20,7 @@ fn every_protocol() -> Options {
     Options { protocols: Protocol::ALL.to_vec(), ..Options::default() }
 }
 
-/// Identifiers that protocols know, few of each, so that frames meet.
+/// Identifiers that protocols use, few of each, so that frames collide.
 fn known_id(random: &mut fastrand::Rng) -> Id {
     let node = random.u32(0..4);
     match random.u8(0..8) {
@@ -52,7 +52,7 @@ fn any_frames_are_taken_by_every_protocol_and_each_event_can_be_written() {
         for _ in 0..20_000 {
             time_ns += random.i64(0..3_000_000);
             let mut data: Vec<u8> = (0..random.usize(0..9)).map(|_| random.u8(..)).collect();
-            // What begins, goes on and ends.
+            // Frames that begin, continue and end transfers.
             if let Some(first) = data.first_mut().filter(|_| random.bool()) {
                 *first = [0x10, 0x20, 0x21, 0x22, 0x30, 0x03, 0x40, 0x43, 0x60, 0x80][random.usize(0..10)];
             }
@@ -100,14 +100,14 @@ fn any_text_is_taken_as_a_sheet() {
     }
 }
 
-/// This process's memory that is in use, in bytes.
+/// This process's memory in use, in bytes.
 #[cfg(target_os = "linux")]
 fn resident() -> usize {
     let text = std::fs::read_to_string("/proc/self/statm").unwrap();
     text.split(' ').nth(1).unwrap().parse::<usize>().unwrap() * 4096
 }
 
-/// First frames of four protocols from ever new senders, none of which goes on.
+/// First frames of four protocols from ever new senders, none of which continues.
 #[cfg(target_os = "linux")]
 #[test]
 fn memory_is_flat_under_a_flood_of_messages_that_are_never_finished() {

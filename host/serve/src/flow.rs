@@ -1,9 +1,9 @@
-//! How much is on its way to a client at a time.
+//! How much is in transit to a client at a time.
 //!
-//! What ssh, a tunnel or a modem holds between server and client holds up answers, too: two megabytes are half a minute of a slow line, and
-//! a client that waits half a minute for an answer takes the board for dead. So a client says now and then how many bytes it has read, and
-//! the server keeps no more on its way than arrives in a fraction of a second. The rest waits in the client's outbox, where answers go
-//! first and what does not fit is counted. A client that never says so is written to as its system lets us.
+//! What ssh, a tunnel or a modem holds between server and client delays answers, too: two megabytes are half a minute on a slow line, and
+//! a client that waits half a minute for an answer gives the board up. So a client reports now and then how many bytes it has read, and
+//! the server keeps no more in transit than arrives in a fraction of a second. The rest waits in the client's outbox, where answers go
+//! first and what does not fit is counted. To a client that never reports, the server writes as fast as the connection takes it.
 
 use std::collections::VecDeque;
 use std::io::{self, Read, Write};
@@ -19,18 +19,18 @@ const MARK: [u8; 3] = [0xFF; 3];
 /// The mark, and the bytes that were read since the connection began, little-endian.
 const ACK_LEN: usize = MARK.len() + size_of::<u64>();
 
-/// A client says what it has read when it was as much as this,
+/// A client reports after reading this many bytes,
 const ACK_BYTES: u64 = 8 * 1024;
-/// or this much later.
+/// or after this time.
 const ACK_AFTER: Duration = Duration::from_millis(50);
 
-/// What is on its way is to arrive within this time: far less than the 1.4 s after which a device that answers nothing is given up.
+/// What is in transit should arrive within this time: far less than the 1.4 s after which a device that answers nothing is given up.
 const TARGET: Duration = Duration::from_millis(400);
-/// Bytes on their way at first: less than that time of a line of 20 kB/s.
+/// Bytes in transit at first: less than that time of a line of 20 kB/s.
 const FIRST_WINDOW: u64 = 8 * 1024;
-/// At least.
+/// The least window, in bytes.
 const LEAST_WINDOW: u64 = 2 * 1024;
-/// At most: two saturated channels over a line that takes a second there and back.
+/// The largest: two saturated channels over a line with a round trip of a second.
 const MOST_WINDOW: u64 = 256 * 1024;
 
 /// The number of bytes read that a message tells, if it is an acknowledgement.
@@ -50,7 +50,7 @@ fn ack(read: u64) -> Vec<u8> {
     out
 }
 
-/// The server's side: what is on its way to one client.
+/// The server's side: what is in transit to one client.
 #[derive(Debug)]
 pub struct Flow {
     sent: u64,
@@ -60,7 +60,7 @@ pub struct Flow {
     writes: VecDeque<(u64, Instant)>,
     /// What was written before says nothing about the window as it is now.
     changed_at: u64,
-    /// The client says what it reads.
+    /// The client reports what it reads.
     is_told: bool,
 }
 

@@ -1,4 +1,5 @@
-//! What waits for one client. Whoever puts something in never waits; where there is no room, the client loses, counted.
+//! Queues everything for one client. Adding never blocks; if there is no room, the client loses records, which are
+//! counted.
 
 use std::collections::VecDeque;
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
@@ -10,44 +11,44 @@ use cantap_wire::{CHANNELS, Channel};
 use crate::flow::Flow;
 use crate::stream::{ClientId, Counts, Entry, Gap, View, Views, count, shown};
 
-/// Records that wait for a client at most: six seconds of two saturated channels, in at most 15 MB, which all clients share as far as they
-/// wait for the same.
+/// Limit for records waiting for a client: six seconds of two saturated channels, in at most 15 MB, which clients share if they wait for
+/// the same records.
 pub const MOST_RECORDS: usize = 1 << 18;
-/// Answers that wait at most; with more, the client's next request is not read.
+/// Limit for waiting answers; beyond it, the client's next request is not read.
 const MOST_ANSWERS: usize = 64;
-/// Taken to be written at a time.
+/// Records taken for writing at a time.
 const TAKEN_RECORDS: usize = 4096;
-/// Bytes that a record takes at most, most of the time.
+/// Bytes of a typical large record.
 const RECORD_BYTES: u64 = 16;
-/// Whoever closes a channel is given what waits for him for so long. A line that carries the buses needs milliseconds; one that does not would
-/// have him wait for as long as it is behind.
+/// How long a client that closes a channel still gets what is waiting. A line that carries the buses needs milliseconds; on one that does not,
+/// the client would wait for as long as the line is behind.
 const REST_TIMEOUT: Duration = Duration::from_secs(2);
 
-/// One thing to tell the client.
+/// One thing to send to the client.
 pub enum Item {
-    /// A session begins with this answer, encoded, at this time.
+    /// A session begins with this encoded answer, at this time.
     Restart(Vec<u8>, u64),
-    /// A channel is the client's from here on.
+    /// The client has a channel from here on.
     Attach(Channel, View, u64),
-    /// Nothing of the channel follows, and from the moment on what waits before it is not sent any more.
+    /// Nothing more follows of the channel. From this moment on, what is still waiting before it is given up.
     Detach(Channel, u64, Instant),
     /// Records.
     Chunk(Arc<[Entry]>),
-    /// Records that there was no room for.
+    /// Records for which there was no room.
     Gap(Gap),
     /// The session is over.
     Ended(EndReason, u64),
 }
 
-/// What there is to write.
+/// What to write.
 #[derive(Default)]
 pub struct Work {
-    /// Encoded.
+    /// Encoded answers.
     pub answers: Vec<Vec<u8>>,
-    /// Too late to be sent: a channel was closed behind it.
+    /// Too late to send: a channel behind it was closed too long ago.
     pub given_up: Vec<Item>,
     pub items: Vec<Item>,
-    /// Nothing follows.
+    /// Nothing more follows.
     pub is_last: bool,
 }
 
@@ -55,19 +56,19 @@ pub struct Work {
 struct Queue {
     answers: VecDeque<Vec<u8>>,
     items: VecDeque<Item>,
-    /// Records in the items.
+    /// Number of records in the items.
     records: usize,
     gap: Option<Gap>,
     flow: Flow,
-    /// Sent frames of others among what was given up, which count as frames only then.
+    /// Frames sent by others among what was given up: only as losses do they count as frames.
     given_up: [u32; CHANNELS],
-    /// Nothing more is put in.
+    /// Nothing more is added.
     is_closed: bool,
-    /// Nobody takes anything out any more.
+    /// Nothing more is taken out.
     is_abandoned: bool,
 }
 
-/// What waits for one client.
+/// The queue for one client.
 pub struct Outbox {
     queue: Mutex<Queue>,
     changed: Condvar,
@@ -80,11 +81,12 @@ impl Outbox {
     }
 
     fn lock(&self) -> MutexGuard<'_, Queue> {
-        // Every holder leaves the queue whole.
+        // Every holder of the lock leaves the queue consistent.
         self.queue.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Puts records in, as far as the client sees them, and counts them for its status. It may have no room: then they are its losses.
+    /// Adds records, as far as the client sees them, and counts them for its status. Records for which there is no room are the
+    /// client's losses.
     pub fn offer(
         &self,
         chunk: &Arc<[Entry]>,
@@ -93,7 +95,7 @@ impl Outbox {
         counts: &mut [Counts; CHANNELS],
     ) {
         let mut queue = self.lock();
-        // After a loss there has to be some room before anything is taken: one long gap says the same as many short ones.
+        // After a loss, wait for some room before accepting anything: one long gap says the same as many short ones.
         let most = if queue.gap.is_some() { self.most_records / 2 } else { self.most_records };
         let has_room = queue.records + chunk.len() <= most;
         let mut seen = 0;
@@ -106,7 +108,7 @@ impl Outbox {
                 && let Some(channel) = queue.gap.get_or_insert_default().absorb(entry.ticks, &record)
                 && !matches!(record, cantap_wire::record::Record::Received(_))
             {
-                // The client will count it among what arrived and was lost.
+                // The client will count it as both received and lost.
                 let frames = &mut counts[channel.index()].frames;
                 *frames = frames.wrapping_add(1);
             }
@@ -119,13 +121,13 @@ impl Outbox {
         self.changed.notify_all();
     }
 
-    /// Puts something in that takes no room.
+    /// Adds something that takes no room.
     pub fn push(&self, item: Item) {
         self.lock().push(item);
         self.changed.notify_all();
     }
 
-    /// Nothing of a channel follows. What waits is sent for [`REST_TIMEOUT`]; then the rest of it is the client's loss.
+    /// Nothing more follows of a channel. What is waiting is sent for [`REST_TIMEOUT`]; the rest is the client's loss.
     pub fn detach(&self, channel: Channel, ticks: u64) {
         self.push(Item::Detach(channel, ticks, Instant::now() + REST_TIMEOUT));
     }
@@ -159,7 +161,7 @@ impl Outbox {
         self.lock().given_up
     }
 
-    /// Begins a session: what waits belongs to none.
+    /// Begins a session: what is waiting belongs to none.
     pub fn restart(&self, answer: Vec<u8>, ticks: u64) {
         let mut queue = self.lock();
         let is_closed = queue.is_closed;
@@ -171,7 +173,7 @@ impl Outbox {
         self.changed.notify_all();
     }
 
-    /// Puts an answer in. Waits while too many are there. Returns whether anybody takes them.
+    /// Adds an answer. Waits while there are too many. Returns whether anybody takes them.
     pub fn answer(&self, bytes: Vec<u8>) -> bool {
         let full = |queue: &mut Queue| queue.answers.len() >= MOST_ANSWERS && !queue.is_abandoned;
         let waited = self.changed.wait_while(self.lock(), full);
@@ -183,7 +185,7 @@ impl Outbox {
         is_there
     }
 
-    /// What there is to write next, waited for at most `timeout`.
+    /// What to write next, waiting at most `timeout`.
     pub fn take(&self, timeout: Duration) -> Work {
         let idle = |queue: &mut Queue| {
             let nothing = queue.items.is_empty() && queue.gap.is_none() && !queue.is_closed;
@@ -216,13 +218,13 @@ impl Outbox {
         work
     }
 
-    /// Nothing more is put in; what waits can still be taken.
+    /// Nothing more is added; what is waiting can still be taken.
     pub fn close(&self) {
         self.lock().is_closed = true;
         self.changed.notify_all();
     }
 
-    /// Nobody takes anything any more.
+    /// Nothing more is taken.
     pub fn abandon(&self) {
         let mut queue = self.lock();
         *queue = Queue { is_closed: true, is_abandoned: true, ..Queue::default() };

@@ -1,5 +1,7 @@
-//! A client behind a line that carries less than its buses do: it loses, counted, and its requests are answered in time all the same.
+//! A client on a line that carries less than its buses do: it loses frames, counted, and its requests are still answered in time.
 #![cfg(unix)]
+
+mod line;
 
 use std::io::{Read, Write};
 use std::os::unix::net::{UnixListener, UnixStream};
@@ -11,29 +13,12 @@ use cantap::device::{ChannelCounters, Device, Link};
 use cantap::wire::message::Role;
 use cantap::{Channel, TraceEvent};
 use cantap_serve::{Board, Settings, connect, listen};
+use line::SlowLine;
 
 const BITRATE_BPS: u32 = 1_000_000;
-/// Two saturated channels take 210 000.
+/// Two saturated channels need 210 000.
 const BYTES_PER_S: usize = 80_000;
 const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
-
-/// A line that carries so many bytes in a second.
-struct SlowLine {
-    stream: UnixStream,
-    began: Instant,
-    taken: usize,
-}
-
-impl Read for SlowLine {
-    fn read(&mut self, out: &mut [u8]) -> std::io::Result<usize> {
-        let due = self.began + Duration::from_secs_f64(self.taken as f64 / BYTES_PER_S as f64);
-        std::thread::sleep(due.saturating_duration_since(Instant::now()));
-        let most = out.len().min(BYTES_PER_S / 50);
-        let len = self.stream.read(&mut out[..most])?;
-        self.taken += len;
-        Ok(len)
-    }
-}
 
 const BOARD: &str = "load=100,frames=std0";
 /// Both channels' frames in a second: 48 bits each.
@@ -87,7 +72,7 @@ fn requests_over_a_slow_line_are_answered_in_time_and_its_end_is_prompt() {
     stream.set_read_timeout(Some(SOCKET_TIMEOUT)).unwrap();
     stream.set_write_timeout(Some(SOCKET_TIMEOUT)).unwrap();
     let writer = stream.try_clone().unwrap();
-    let line = SlowLine { stream, began: Instant::now(), taken: 0 };
+    let line = SlowLine::new(stream, BYTES_PER_S);
     let device = Device::over(Link::new(line, writer), "slow").unwrap();
     listen_to_both(&device);
     // Until all that can wait on the way waits.

@@ -1,9 +1,9 @@
 //! CANopen (CiA 301): network management, boot-up, heartbeat and guarding, SYNC, TIME, EMCY, SDO, PDO, LSS (CiA 305).
 //!
-//! What comes again and again is reported when it changes: a node's state, a heartbeat that stops and comes back, the first SYNC and a
-//! counter that jumps. PDOs have names and values where an EDS or SDO transfers that were heard say what they carry.
+//! Whatever repeats is reported only when it changes: a node's state, a heartbeat that stops or resumes, the first SYNC, a counter
+//! that jumps. PDOs have names and values if an EDS or observed SDO transfers define their content.
 //!
-//! Memory: for each node of each channel one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
+//! Memory: for each node on each channel, one SDO transfer of at most 64 KiB and the mappings of 512 PDOs.
 
 pub mod eds;
 mod encode;
@@ -35,35 +35,35 @@ pub(crate) use self::signs::CanOpenSigns;
 use crate::{Assembler, Event, Field, Party, Protocol, Trouble, UnderWay, is_gap};
 
 const SWEEP_NS: i64 = 50_000_000;
-/// A heartbeat is missed after this many of its periods.
+/// A heartbeat counts as missing after this many of its periods.
 const MISSED_PERIODS: f64 = 2.5;
-/// How long a node may take to answer a guard.
+/// How long a node may take to answer a guarding request.
 const GUARD_NS: i64 = 500_000_000;
 
-/// A node's own sheet.
+/// A node's data sheet.
 #[derive(Clone, Debug)]
 pub struct Sheet {
-    /// The node's number; all nodes that have no sheet of their own without it.
+    /// The node's number; `None` if it is for all nodes without a sheet of their own.
     pub node: Option<u8>,
-    /// What it says.
+    /// Its content.
     pub eds: Arc<Eds>,
 }
 
 #[derive(Default)]
 struct Node {
     state: Option<u8>,
-    /// The last heartbeat, and the time between it and the one before, or what was set.
+    /// The last heartbeat, and its period: measured, or as configured.
     beat_ns: Option<i64>,
     period_ns: Option<i64>,
     is_period_set: bool,
     is_missing: bool,
-    /// How long others wait for its heartbeat, as somebody was told by object 1016; the shortest.
+    /// The shortest time for which others wait for its heartbeat, as configured in their object 1016.
     consumer_ns: Option<i64>,
-    /// Objects 100C and 100D, as they were set: milliseconds and how many of them.
+    /// Objects 100C and 100D as configured: guard time in milliseconds, and life time factor.
     life: (i64, i64),
-    /// When it was last guarded, until that has stopped for longer than its life time.
+    /// When it was last guarded; `None` once that has stopped for longer than its life time.
     guarded_ns: Option<i64>,
-    /// A guard that waits for its answer.
+    /// A guarding request that waits for its answer.
     guard_ns: Option<i64>,
     toggle: Option<bool>,
     sdo: Sdo,
@@ -72,7 +72,7 @@ struct Node {
 }
 
 impl Node {
-    /// Takes what an SDO transfer that was written says of timeouts; of another node's, who it is and how long in nanoseconds.
+    /// Takes timeouts from an SDO transfer that wrote them; returns those of another node, with its number and in nanoseconds.
     fn learn_timeouts(&mut self, transfer: &SdoTransfer) -> Option<(u8, i64)> {
         if transfer.trouble.is_some() || !transfer.is_write {
             return None;
@@ -94,25 +94,25 @@ impl Node {
 #[derive(Default)]
 struct Bus {
     nodes: FxHashMap<u8, Node>,
-    /// Which node's PDO an identifier is, where that is not the predefined one.
+    /// Which node's PDO an identifier is, if it is not the predefined one.
     pdo_ids: FxHashMap<u16, (u8, u16)>,
     lss: Lss,
     sync_ns: Option<i64>,
     sync_counter: Option<u8>,
 }
 
-/// Reads a CANopen bus.
+/// Decodes a CANopen bus.
 #[derive(Default)]
 pub struct CanOpen {
     buses: FxHashMap<u8, Bus>,
     sheets: Vec<Sheet>,
-    /// Identifiers of PDOs that the sheets say, where they are not the predefined ones.
+    /// Identifiers of PDOs according to the sheets, if they are not the predefined ones.
     sheet_ids: FxHashMap<u16, (u8, u16)>,
     sweep_ns: i64,
 }
 
 impl CanOpen {
-    /// With the nodes' sheets, where there are some.
+    /// With the nodes' sheets, if any.
     pub fn new(sheets: Vec<Sheet>) -> Self {
         let mut sheet_ids = FxHashMap::default();
         for sheet in &sheets {
@@ -167,7 +167,7 @@ impl CanOpen {
                     event.fields.push(Field::hex("code", code, 4).meaning(Some(names::emergency(code))));
                     event.fields.push(Field::hex("register", register, 2).meaning(register_text(register)));
                     event.fields.push(Field::bytes("manufacturer", rest));
-                    // As long as it should be, or else what is there.
+                    // Of the required length, or else what is there.
                     event.trouble =
                         (rest.len() != 5).then_some(Trouble::Malformed("an emergency has 8 bytes"));
                     events.push(event);
@@ -224,7 +224,7 @@ impl CanOpen {
             }
             0x701..=0x77F => heartbeat(bus, record, node, data, events),
             0x180..=0x57F => {
-                // Four PDOs each way have identifiers of their own.
+                // Four PDOs in each direction have their own identifiers.
                 let (node, number) = bus.pdo_ids.get(&id).copied().unwrap_or((node, id & 0x780));
                 let entry = bus.nodes.entry(node).or_default();
                 let sheet = Self::sheet(sheets, node);
@@ -239,7 +239,7 @@ impl CanOpen {
         }
     }
 
-    /// Says what has not come.
+    /// Reports what has not come.
     fn sweep(&mut self, now_ns: i64, events: &mut Vec<Event>) {
         self.sweep_ns = now_ns.saturating_add(SWEEP_NS);
         let from = events.len();
@@ -314,12 +314,12 @@ impl CanOpen {
     }
 }
 
-/// The number in at most four bytes, the lowest first.
+/// The number in at most four bytes, least significant first.
 fn number_of(bytes: &[u8]) -> u32 {
     bytes.iter().take(4).rev().fold(0, |number, byte| number << 8 | u32::from(*byte))
 }
 
-/// A record of no frame, for events that no frame makes.
+/// A record without a frame, for events that no frame causes.
 const fn nothing(channel: u8) -> TraceRecord {
     TraceRecord { time_ns: 0, channel, event: cantap_trace::TraceEvent::GAP }
 }
@@ -328,7 +328,7 @@ fn event(record: &TraceRecord, kind: &'static str, title: impl Into<Cow<'static,
     Event::new(Protocol::CanOpen, record, kind, title)
 }
 
-/// An event of what is not as the protocol has it.
+/// An event for something that violates the protocol.
 fn malformed(record: &TraceRecord, kind: &'static str, title: &'static str, fault: &'static str) -> Event {
     let mut event = event(record, kind, title);
     event.fields.push(Field::bytes("data", &event.data));
@@ -359,7 +359,7 @@ fn sync(bus: &mut Bus, record: &TraceRecord, data: &[u8], events: &mut Vec<Event
         event.fields.extend(counter.map(|counter| Field::number("counter", counter)));
         events.push(event);
     } else if let (Some(before), Some(counter)) = (before, counter)
-        // After its highest value, which is set in each node, it begins with 1.
+        // After its highest value, which is configured in each node, it restarts at 1.
         && counter != 1
         && counter != before.wrapping_add(1)
     {
@@ -382,7 +382,7 @@ fn guard(bus: &mut Bus, record: &TraceRecord, node: u8, events: &mut Vec<Event>)
     }
 }
 
-/// A heartbeat, a boot-up, or the answer to a guard.
+/// A heartbeat, a boot-up message, or the answer to a guarding request.
 fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], events: &mut Vec<Event>) {
     let known = if let &[byte] = data { names::state(byte & 0x7F).map(|title| (byte, title)) } else { None };
     let Some((byte, title)) = known else {
@@ -410,7 +410,7 @@ fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], events:
         return;
     }
     if state == 0 {
-        // A node that has just started: its heartbeat and its toggle bit begin anew.
+        // A node that has just started: its heartbeat and its toggle bit start over.
         (entry.beat_ns, entry.toggle, entry.is_missing) = (None, None, false);
         if !entry.is_period_set {
             entry.period_ns = None;
@@ -425,7 +425,7 @@ fn heartbeat(bus: &mut Bus, record: &TraceRecord, node: u8, data: &[u8], events:
         && !was_missing
     {
         let period_ns = record.time_ns.saturating_sub(beat_ns);
-        // The longest that was seen: a shorter one would miss what only jitters.
+        // The longest one seen: with a shorter one, jitter would be reported as missing.
         entry.period_ns = Some(entry.period_ns.map_or(period_ns, |known| known.max(period_ns)));
     }
     if was_missing {
@@ -492,7 +492,7 @@ impl Assembler for CanOpen {
                 for node in bus.nodes.values_mut() {
                     node.frames_lost = true;
                     node.toggle = None;
-                    // Heartbeats may be among what was lost.
+                    // The lost frames may have included heartbeats.
                     node.beat_ns = None;
                     if let Some(open) = &mut node.sdo.open {
                         open.frames_lost = true;

@@ -200,7 +200,7 @@ impl Outbox {
             taken += item.records();
             work.given_up.push(item);
         }
-        let most = taken + (queue.flow.room() / RECORD_BYTES).min(TAKEN_RECORDS as u64) as usize;
+        let most = taken + (queue.room() / RECORD_BYTES).min(TAKEN_RECORDS as u64) as usize;
         while taken < most
             && queue.may_take_items()
             && let Some(item) = queue.items.pop_front()
@@ -246,9 +246,13 @@ impl Item {
 }
 
 impl Queue {
-    /// Whether what waits may go on its way. At the end nobody says any more what has arrived.
+    /// Bytes that may be sent now. At the end nobody listens any more for what the client has read.
+    fn room(&self) -> u64 {
+        if self.is_closed { u64::MAX } else { self.flow.room() }
+    }
+
     fn may_take_items(&self) -> bool {
-        self.is_closed || self.flow.room() >= RECORD_BYTES
+        self.room() >= RECORD_BYTES
     }
 
     /// How many items stand up to the last channel that was closed too long ago.
@@ -263,5 +267,37 @@ impl Queue {
         }
         self.items.extend(self.gap.take().map(Item::Gap));
         self.items.push_back(item);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A client on a slow line still learns that its server has ended.
+    #[test]
+    fn at_the_end_everything_is_written_however_little_the_client_has_read() {
+        let outbox = Outbox::new(1000);
+        outbox.acknowledge(0);
+        outbox.wrote(1_000_000);
+        outbox.push(Item::Ended(EndReason::ServerEnded, 0));
+        assert!(outbox.take(Duration::ZERO).items.is_empty() && outbox.is_held_up());
+        outbox.close();
+        let work = outbox.take(Duration::ZERO);
+        assert!(work.items.len() == 1 && work.is_last);
+    }
+
+    #[test]
+    fn what_waits_in_front_of_a_closed_channel_is_given_up_after_a_while() {
+        let outbox = Outbox::new(1000);
+        outbox.acknowledge(0);
+        outbox.wrote(1_000_000);
+        outbox.push(Item::Chunk(Arc::from([])));
+        outbox.push(Item::Detach(Channel::Can1, 0, Instant::now() + Duration::from_hours(1)));
+        assert!(outbox.take(Duration::ZERO).given_up.is_empty());
+        outbox.push(Item::Detach(Channel::Can2, 0, Instant::now()));
+        outbox.push(Item::Ended(EndReason::ServerEnded, 0));
+        let work = outbox.take(Duration::ZERO);
+        assert_eq!((work.given_up.len(), work.items.len()), (3, 0));
     }
 }

@@ -4,6 +4,8 @@ use cantap_wire::Refusal;
 use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{Request, why_unreadable};
 
+use crate::flow;
+
 /// The most bytes before a zero that can be a request.
 const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
 
@@ -17,7 +19,7 @@ pub enum Heard {
     Unreadable(u16, Refusal),
     /// The client has read so many bytes since the connection began.
     Read(u64),
-    /// What cannot be answered: nobody can tell whose it is.
+    /// It cannot be answered: nobody can tell which request it was.
     Damaged,
 }
 

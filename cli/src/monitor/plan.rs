@@ -8,7 +8,6 @@ use cantap_address::Address;
 
 use crate::channel_args::ChannelArgs;
 use crate::channel_bitrate::ChannelBitrate;
-use crate::timing_args::TimingArgs;
 
 /// Which devices, and how to take part in their buses.
 #[derive(Clone, Debug)]
@@ -34,15 +33,13 @@ impl Plan {
         plan
     }
 
-    /// The same with other devices. Their buses are others, of which bit rates that were given before say nothing: what is saved there
-    /// counts, or what is heard.
+    /// The same with other devices. With more or fewer of them, it has other channels, too.
     pub fn at(&self, addresses: Vec<Address>) -> Self {
-        if addresses == self.addresses {
-            return self.clone();
-        }
+        let is_as_many = addresses.len() == self.addresses.len();
         let mut plan = Self { addresses, ..self.clone() };
-        plan.open.timing = TimingArgs::default();
-        plan.choose_channels();
+        if !is_as_many {
+            plan.choose_channels();
+        }
         plan
     }
 

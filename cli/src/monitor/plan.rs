@@ -33,7 +33,7 @@ impl Plan {
         plan
     }
 
-    /// The same with other devices. With more or fewer of them, it has other channels, too.
+    /// The same with other devices. If their number differs, so do the channels.
     pub fn at(&self, addresses: Vec<Address>) -> Self {
         let is_as_many = addresses.len() == self.addresses.len();
         let mut plan = Self { addresses, ..self.clone() };

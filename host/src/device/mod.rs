@@ -261,7 +261,8 @@ impl Device {
         let mut seen = self.shared.published();
         let mut quiet = Instant::now();
         let goes_on = |seen: &reader::Published| {
-            let stopped = |channel: &Channel| seen.stopped[channel.index()] != before.stopped[channel.index()];
+            let stopped =
+                |channel: &Channel| seen.stopped[channel.index()] != before.stopped[channel.index()];
             !open.iter().all(stopped)
         };
         while goes_on(&seen) {

@@ -167,7 +167,7 @@ impl Outbox {
         let is_closed = queue.is_closed;
         let is_abandoned = queue.is_abandoned;
         let flow = std::mem::take(&mut queue.flow);
-        *queue = Queue { is_closed, is_abandoned, flow, ..Queue::default() };
+        *queue = Queue { flow, is_closed, is_abandoned, ..Queue::default() };
         queue.items.push_back(Item::Restart(answer, ticks));
         drop(queue);
         self.changed.notify_all();

@@ -65,6 +65,9 @@ fn of_device(error: &DeviceError) -> Option<String> {
             "; its server has ended, or does not let this client in"
         }
         DeviceError::Vanished { .. } => "; plug it in again",
+        DeviceError::Silent { address, .. } if Server::is_meant(address) => {
+            "; the line to its server may be too slow or interrupted, or the server hangs"
+        }
         DeviceError::Silent { .. } => "; if that stays so, unplug it and plug it in again",
         DeviceError::NoChannel { .. } => "; choose one it has with -c",
         DeviceError::Refused { refusal } => match refusal {
@@ -140,6 +143,9 @@ mod tests {
             sentence(&error),
             "'X' cannot be opened as a serial port: broken; check the address with `cantap list`"
         );
+        // Nobody is to be sent to a cable that is on another computer.
+        let error = DeviceError::Silent { address: "ssh://car".to_owned(), seconds: 1.4 };
+        assert!(told(&error).contains("the line to its server"), "{}", told(&error));
         let error = DeviceError::Refused { refusal: Refusal::Unsupported };
         assert_eq!(told(&error), "the device refused: it cannot do that; `cantap info` shows what it can");
         let error = anyhow::Error::from(TimingError::TripleSampling).context("channel 1");

@@ -130,6 +130,10 @@ impl Client {
                             self.answer(id, &result)
                         }
                         Heard::Unreadable(id, refusal) => self.answer(id, &Err(refusal)),
+                        Heard::Read(bytes) => {
+                            self.outbox.acknowledge(bytes);
+                            true
+                        }
                         Heard::Damaged => true,
                     };
             });
@@ -288,10 +292,11 @@ impl Client {
         };
         let state = self.shared.state();
         let Some(member) = state.clients.get(&self.id) else { return Err(Refusal::NoSession) };
+        let given_up = self.outbox.given_up();
         for (channel, of_channel) in Channel::ALL.into_iter().zip(&mut status.channels) {
             let counts = &member.counts[channel.index()];
             of_channel.open = member.views[channel.index()].config;
-            of_channel.frames = counts.frames;
+            of_channel.frames = counts.frames.wrapping_add(given_up[channel.index()]);
             of_channel.lost_controller = counts.lost_controller;
             of_channel.lost_queue = counts.lost_queue;
             of_channel.transmitted = counts.transmitted;

@@ -11,6 +11,8 @@ use std::time::Duration;
 
 use cantap::device::{Link, pipe};
 
+use crate::flow::acknowledging;
+
 /// A read or write on a socket returns after this time at the latest.
 pub(crate) const SOCKET_TIMEOUT: Duration = Duration::from_millis(50);
 /// Time limit for connecting to a computer.
@@ -39,14 +41,14 @@ pub fn unix(path: &Path) -> io::Result<Link> {
     reader.set_read_timeout(Some(SOCKET_TIMEOUT))?;
     reader.set_write_timeout(Some(SOCKET_TIMEOUT))?;
     let writer = reader.try_clone()?;
-    Ok(Link::new(reader, writer))
+    Ok(acknowledging(Link::new(reader, writer)))
 }
 
 /// Connects to a server at `HOST:PORT`, without encryption.
 pub fn tcp(address: &str) -> io::Result<Link> {
     let reader = dial(address)?;
     let writer = reader.try_clone()?;
-    Ok(Link::new(reader, writer))
+    Ok(acknowledging(Link::new(reader, writer)))
 }
 
 /// A socket that returns within a fraction of a second.
@@ -93,7 +95,7 @@ pub fn program(command: &mut Command) -> io::Result<Link> {
     if !reader.wait_for_bytes(START_TIMEOUT) && !reader.is_closed() {
         return Err(io::Error::new(io::ErrorKind::TimedOut, "it is not ready after 30 s"));
     }
-    Ok(Link::new(reader, writer).keeping(child))
+    Ok(acknowledging(Link::new(reader, writer).keeping(child)))
 }
 
 /// A program that ends when nobody needs it any more.

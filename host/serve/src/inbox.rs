@@ -4,6 +4,8 @@ use cantap_wire::Refusal;
 use cantap_wire::framing::{CRC_LEN, MAX_REQUEST, max_encoded_len, unseal};
 use cantap_wire::message::{Request, why_unreadable};
 
+use crate::flow;
+
 /// The most bytes before a zero that can be a request.
 const MOST: usize = max_encoded_len(MAX_REQUEST) - 1;
 
@@ -15,6 +17,8 @@ pub enum Heard {
     Request(Request),
     /// A request of which only the number is readable, and what is wrong with it.
     Unreadable(u16, Refusal),
+    /// The client has read so many bytes since the connection began.
+    Read(u64),
     /// It cannot be answered: nobody can tell which request it was.
     Damaged,
 }
@@ -55,7 +59,7 @@ fn read(encoded: &[u8]) -> Heard {
         Ok((request, _)) => Heard::Request(request),
         Err(_) => match postcard::take_from_bytes::<u16>(message) {
             Ok((id, _)) => Heard::Unreadable(id, why_unreadable(message)),
-            Err(_) => Heard::Damaged,
+            Err(_) => flow::read_ack(message).map_or(Heard::Damaged, Heard::Read),
         },
     }
 }

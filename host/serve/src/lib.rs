@@ -9,6 +9,7 @@
 mod board;
 mod client;
 pub mod connect;
+mod flow;
 mod inbox;
 pub mod lines;
 pub mod listen;

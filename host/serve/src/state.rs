@@ -305,7 +305,7 @@ impl State {
         if let Some(member) = self.clients.get_mut(&client)
             && member.views[channel.index()].config.take().is_some()
         {
-            member.outbox.push(Item::Detach(channel, ticks));
+            member.outbox.detach(channel, ticks);
         }
     }
 

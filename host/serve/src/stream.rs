@@ -172,6 +172,18 @@ impl Gap {
         None
     }
 
+    /// Appends the gap that follows this one.
+    pub fn join(&mut self, next: Self) {
+        next.kept.into_iter().for_each(|(ticks, event)| self.keep(ticks, event));
+        for (sum, more) in self.lost.iter_mut().zip(next.lost) {
+            *sum += more;
+        }
+        for (sum, more) in self.errors.iter_mut().zip(next.errors) {
+            *sum += more;
+        }
+        self.ticks = self.ticks.max(next.ticks);
+    }
+
     /// Keeps an event, or merges it with one of its kind: the number kept is bounded.
     fn keep(&mut self, ticks: u64, event: Event) {
         let place = self.kept.iter_mut().rev().find_map(|(at, kept)| merge(kept, &event).then_some(at));

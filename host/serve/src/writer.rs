@@ -8,19 +8,21 @@ use cantap_wire::batch::BatchWriter;
 use cantap_wire::framing::MAX_ENCODED;
 use cantap_wire::message::EndReason;
 use cantap_wire::record::{MAX_RECORD, Record, encode_event, encode_received};
-use cantap_wire::{Channel, Event, Stamp};
+use cantap_wire::{CHANNELS, Channel, Event, Stamp};
 
 use crate::outbox::{Item, Outbox};
-use crate::stream::{ClientId, Views, shown};
+use crate::stream::{ClientId, Gap, Views, shown};
 
 /// How often to check whether the connection is over while there is nothing to write.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// A client that takes nothing for this long is gone: a peer that was switched off sends nothing.
 const PATIENCE: Duration = Duration::from_secs(30);
+const TOOK_NOTHING: &str = "it took nothing for 30 s";
 
 /// Writes until nothing follows. An error says why the client is dropped.
 pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<(), String> {
     let mut encoder = Encoder::new(client);
+    let mut moved = Instant::now();
     loop {
         let work = outbox.take(LOOK_EVERY);
         for answer in &work.answers {
@@ -28,11 +30,20 @@ pub fn run(outbox: &Outbox, output: &mut dyn Write, client: ClientId) -> Result<
             encoder.out.push(0);
             encoder.out.extend_from_slice(answer);
         }
+        if !work.given_up.is_empty() {
+            outbox.give_up(encoder.give_up(work.given_up));
+        }
         for item in work.items {
             encoder.take(item);
         }
         encoder.finish();
+        if !encoder.out.is_empty() || !outbox.is_held_up() {
+            moved = Instant::now();
+        } else if moved.elapsed() >= PATIENCE {
+            return Err(TOOK_NOTHING.to_owned());
+        }
         write(output, &encoder.out, outbox)?;
+        outbox.wrote(encoder.out.len());
         encoder.out.clear();
         if work.is_last {
             return Ok(());
@@ -52,7 +63,7 @@ fn write(output: &mut dyn Write, mut bytes: &[u8], outbox: &Outbox) -> Result<()
             }
             Err(error) if is_idle(&error) => {
                 if moved.elapsed() >= PATIENCE {
-                    return Err(format!("it took nothing for {} s", PATIENCE.as_secs()));
+                    return Err(TOOK_NOTHING.to_owned());
                 }
                 // At the end, a client that does not read is not waited for.
                 let is_late = |since: &mut Instant| since.elapsed() >= Duration::from_secs(1);
@@ -103,7 +114,7 @@ impl Encoder {
                 self.views[channel.index()] = view;
                 self.event(ticks, Event::Started { channel });
             }
-            Item::Detach(channel, ticks) => self.stop(channel, ticks),
+            Item::Detach(channel, ticks, _) => self.stop(channel, ticks),
             Item::Chunk(chunk) => {
                 for entry in chunk.iter() {
                     if let Some(record) = shown(entry, self.client, &self.views) {
@@ -118,6 +129,32 @@ impl Encoder {
             }
             Item::Ended(reason, ticks) => self.end(reason, ticks),
         }
+    }
+
+    /// What is not sent any more is a loss where it would have stood. Returns the frames of each channel that count as such only by
+    /// being lost: those that others sent.
+    fn give_up(&mut self, items: Vec<Item>) -> [u32; CHANNELS] {
+        let mut others = [0; CHANNELS];
+        let mut lost = Gap::default();
+        for item in items {
+            match item {
+                Item::Chunk(chunk) => {
+                    for entry in chunk.iter() {
+                        let Some(record) = shown(entry, self.client, &self.views) else { continue };
+                        let channel = lost.absorb(entry.ticks, &record);
+                        if let Some(channel) = channel.filter(|_| !matches!(record, Record::Received(_))) {
+                            others[channel.index()] += 1;
+                        }
+                    }
+                }
+                Item::Gap(gap) => lost.join(gap),
+                other => {
+                    self.take(Item::Gap(std::mem::take(&mut lost)));
+                    self.take(other);
+                }
+            }
+        }
+        others
     }
 
     fn stop(&mut self, channel: Channel, ticks: u64) {

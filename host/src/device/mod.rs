@@ -240,14 +240,32 @@ impl Device {
 
     /// Closes a channel and waits until everything it captured has arrived.
     pub fn close_channel(&self, channel: Channel) -> Result<(), DeviceError> {
+        self.close_channels(&[channel])
+    }
+
+    /// Closes channels, all before it waits for any: a slow line is waited for once.
+    fn close_channels(&self, channels: &[Channel]) -> Result<(), DeviceError> {
         let before = self.shared.published();
-        let was_open = self.status()?.channels[channel.index()].open.is_some();
-        self.done(Command::Close { channel })?;
-        // The record that reports it is already in the device's queue, so nothing later comes before it.
+        let status = self.status()?;
+        let mut open = channels.to_vec();
+        open.retain(|channel| status.channels[channel.index()].open.is_some());
+        let closes = channels.iter().map(|channel| self.request_later(Command::Close { channel: *channel }));
+        for close in closes.collect::<Vec<_>>() {
+            match close?.wait()? {
+                Reply::Done => {}
+                _ => return Err(DeviceError::WrongReply),
+            }
+        }
+        // The records that say so are in the device's queue by now, so nothing of a later time is in front of them.
         let closed_at = self.time()?;
         let mut seen = self.shared.published();
         let mut quiet = Instant::now();
-        while was_open && seen.stopped[channel.index()] == before.stopped[channel.index()] {
+        let goes_on = |seen: &reader::Published| {
+            let stopped =
+                |channel: &Channel| seen.stopped[channel.index()] != before.stopped[channel.index()];
+            !open.iter().all(stopped)
+        };
+        while goes_on(&seen) {
             if let Some(gone) = self.shared.gone() {
                 return Err(gone);
             }
@@ -261,7 +279,9 @@ impl Device {
                 break;
             }
         }
-        self.settings().open[channel.index()] = None;
+        for channel in channels {
+            self.settings().open[channel.index()] = None;
+        }
         Ok(())
     }
 
@@ -279,9 +299,7 @@ impl Device {
     }
 
     fn close_and_account(&self) -> Result<Status, DeviceError> {
-        for channel in Channel::ALL {
-            self.close_channel(channel)?;
-        }
+        self.close_channels(&Channel::ALL)?;
         let status = self.status()?;
         let counters = self.counters();
         for channel in Channel::ALL {

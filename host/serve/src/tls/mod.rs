@@ -19,6 +19,7 @@ use rustls::{
 };
 
 use crate::connect::dial;
+use crate::flow::acknowledging;
 use crate::listen::{Listening, accept, admit, bind};
 use crate::{Board, News};
 
@@ -188,5 +189,5 @@ pub fn connect(address: &str, files: &Files) -> Result<Link, TlsError> {
     let secured = shake_hands(stream, Connection::Client(connection), Instant::now() + HANDSHAKE_TIMEOUT)?;
     secured.wait_for_verdict(Instant::now() + VERDICT_TIMEOUT)?;
     let (reader, writer) = secured.split();
-    Ok(Link::new(reader, writer))
+    Ok(acknowledging(Link::new(reader, writer)))
 }

@@ -239,7 +239,7 @@ fn answers(events: &[Value]) -> Vec<(String, String)> {
 #[test]
 fn several_ecus_are_asked_at_once_with_identifiers_of_both_lengths() {
     let Some(rig) = Rig::new(NO_NODE, "isotp", "ecus") else { return };
-    let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<String>();
+    let hex = |text: &str| text.bytes().map(|byte| format!("{byte:02X}")).collect::<Vec<_>>().concat();
     let vin = |number: u8| format!("62F190{}", hex(&format!("WVWZZZ1KZAW00000{number}")));
     for (line, ids) in [
         ("uds --functional", ["7E8", "7E9", "7EA", "7EB"]),
